@@ -289,7 +289,7 @@ def test_control_c_that_python_drops_or_wraps_ends_the_command(work, capsys):
 
 @pytest.mark.slow
 def test_a_command_that_handled_control_c_ends_with_its_own_status(tmp_path):
-    """This holds even for an interrupted `exec`, as in data classes, after which `python -m` would end by SIGINT."""
+    """The command keeps its own status even after an interrupted `exec`, where `python -m` would end by SIGINT."""
     (tmp_path / "work.py").write_text("""
 import contextlib, sys, typer
 from finssim.cli import boundary

@@ -174,7 +174,7 @@ SERVING = {"pool", "teleop", "view", "play", "ros2 up", "ros2 node", "ardusub-si
 
 @pytest.mark.parametrize("words", [words for words in EVERY if words not in SERVING])
 def test_every_command_with_a_result_prints_json(words, capsys):
-    """All of them have the option --json."""
+    """Every command with a result has the option --json."""
     assert boundary.run(app, [*words.split(), "--help"]) == 0
     assert "--json" in capsys.readouterr().out
 
@@ -201,7 +201,7 @@ def test_the_help_lists_commands_by_section_in_the_order_of_use(capsys):
 
 
 def test_garbage_is_searched_again_once_a_command_is_imported():
-    """`main` disables garbage collection until then."""
+    """`main` disables garbage collection until the command is imported."""
     gc.disable()
     try:
         assert command_line.loaded("math:sqrt")(4.0) == 2.0 and gc.isenabled()

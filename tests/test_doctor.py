@@ -13,7 +13,7 @@ from finssim.cli.doctor import EXTRAS, examine
 
 
 def test_a_working_machine_is_called_healthy():
-    """Tests run where the core is installed, and the CPU runs Warp's kernels."""
+    """A machine with the core installed, as for these tests, is reported as healthy; its CPU runs Warp's kernels."""
     found = examine()
     assert found["healthy"]
     assert found["core"]["numpy"] == metadata.version("numpy")

@@ -48,7 +48,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path):
 
 
 def test_new_files_follow_the_umask(tmp_path):
-    """An output is as readable as any other file of the user."""
+    """A new file has the permissions of any other file of the user."""
     (tmp_path / "plain").touch()
     with atomic_write(tmp_path / "ours"):
         pass
@@ -264,7 +264,7 @@ def test_a_directory_has_one_writer(tmp_path, capsys):
 
 
 def test_a_lock_of_a_dead_process_is_replaced_and_one_of_another_computer_is_not(tmp_path):
-    """A killed training can be resumed at once."""
+    """A dead process's lock is replaced, so that a killed training can be resumed; another computer's is kept."""
     lock = tmp_path / ".hold.lock"
     for host, refused in ((socket.gethostname(), False), ("elsewhere", True)):
         lock.write_text(json.dumps({"pid": 2**30, "host": host, "command": "finssim train"}))

@@ -29,13 +29,13 @@ def code(path: Path) -> str:
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_a_notebook_is_committed_without_outputs(path):
-    """Outputs are produced by the reader; a difference then shows only the author's changes."""
+    """A notebook is committed without outputs, so that differences show only its author's changes."""
     assert all(not cell["outputs"] and cell["execution_count"] is None for cell in cells(path))
 
 
 @pytest.mark.parametrize("path", COURSE, ids=lambda path: path.stem)
 def test_the_course_is_committed_as_it_ran(path):
-    """Learners read it before they install anything: every cell ran once, in order, without a warning."""
+    """Learners read the course before they install anything: every cell ran once, in order, without a warning."""
     assert [cell["execution_count"] for cell in cells(path)] == list(range(1, len(cells(path)) + 1))
     outputs = [output for cell in cells(path) for output in cell["outputs"]]
     assert all(o["output_type"] != "error" and o.get("name") != "stderr" for o in outputs)

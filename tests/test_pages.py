@@ -153,7 +153,7 @@ def test_pages_build_without_a_warning(tmp_path):
 
 
 def test_a_page_about_a_package_begins_with_what_to_call_first():
-    """A few lines of code follow, which run with the other Python of the pages."""
+    """A page about a package names the first call, then uses it in a few lines, which run with its other Python."""
     pages = {page: page.read_text(encoding="utf-8") for page in PAGES}
     of_packages = {page: text.partition("\n::: ")[0] for page, text in pages.items() if "\n::: " in text}
     assert len(of_packages) > 15

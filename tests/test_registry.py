@@ -103,7 +103,7 @@ def test_names_of_packages_work_as_those_of_finssim(outside):
 
 
 def test_a_broken_package_is_named_and_stops_only_what_needs_it(broken):
-    """One sentence names it at its first use; everything else is unaffected."""
+    """A broken package is named in one sentence at its first use; everything else is unaffected."""
     sentence = (
         "'lost' of package broken 1.0 cannot be used: broken:lost: ModuleNotFoundError: No module named"
     )

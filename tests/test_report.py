@@ -40,7 +40,7 @@ ANATOMY = {
 
 
 def test_the_pages_that_ship_say_what_the_results_do():
-    """Every figure in their tables comes from `results/`."""
+    """Every figure in the tables of shipped pages comes from `results/`."""
     assert RESULTS and report(RESULTS, into=PAGES, check=True) == 0
     assert all("<!-- report: " in page.read_text(encoding="utf-8") for page in PAGES)
 
@@ -65,7 +65,7 @@ def test_a_block_is_filled_and_the_rest_stays(tmp_path):
 
 
 def test_a_result_in_sentences_is_a_list():
-    """A soak result has no table."""
+    """A soak result, which has no table, is printed as a list."""
     soaked = {
         "experiment": "soak",
         "vehicle_h": 20.0,

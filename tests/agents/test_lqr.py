@@ -60,7 +60,7 @@ def test_no_other_gains_cost_less(lqr, axis):
     ids=["20 Hz", "10 Hz", "current 0.11 m/s", "2 N heavier"],
 )
 def test_all_eight_setpoints_are_held(vehicle, pool, period, water):
-    """Within the success limits and level, started within 15 s; within 1 mm and 0.1 degrees after 30 s."""
+    """Setpoints are held within the success limits, level, from 15 s on; within 1 mm and 0.1 degrees after 30 s."""
     log, _ = run(Lqr.from_vehicle(vehicle, period=period), pool(vehicle, 8, **water), T1, 30.0)
     assert (settling_time(log, period) < 15.0).all()
     assert np.abs(log[-1, :, :3]).max() < 1e-3 and np.abs(log[-1, :, 3]).max() < math.radians(0.1)

@@ -30,8 +30,8 @@ def setpoint(i):
 
 @pytest.mark.slow
 def test_it_predicts_as_the_independent_simulation_moves(vehicle, nmpc, pool):
-    """After a second of random thrusts from a tilted, turning start, they agree to the midpoint step's error: 2 mm,
-    0.4 degrees, 5 mm/s."""
+    """After a second of random thrusts from a tilted, turning start, prediction and simulation agree to the midpoint
+    step's error: 2 mm, 0.4 degrees, 5 mm/s."""
     rng = np.random.default_rng(5)
     plant = pool(vehicle, 1)
     plant.delay, plant.queue = 0, []
@@ -57,8 +57,8 @@ def test_it_predicts_as_the_independent_simulation_moves(vehicle, nmpc, pool):
     ids=["still", "current and 1 N heavier"],
 )
 def test_a_setpoint_is_held(vehicle, nmpc, pool, i, water):
-    """Held within 0.10 m and 10 degrees for 10 s, started within 8 s; 1 cm at the end although the model has
-    no current."""
+    """The setpoint is held within 0.10 m and 10 degrees for 10 s, started within 8 s; 1 cm at the end although the
+    model has no current."""
     log, _ = run(nmpc, pool(vehicle, 1, **water), setpoint(i), 18.0)
     assert settling_time(log, nmpc.period)[0] < 8.0
     assert np.abs(log[-1, :, :3]).max() < 0.01

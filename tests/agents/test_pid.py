@@ -89,7 +89,8 @@ def test_an_axis_that_water_holds_stiffly_is_left_to_it(vehicle):
     ids=["20 Hz", "10 Hz", "current 0.11 m/s", "2 N heavier", "2 N lighter"],
 )
 def test_all_eight_setpoints_are_held(held, period, water):
-    """Within 0.10 m and 10 degrees for 10 s, started within 15 s, and always level; 1 cm and 1 degree at the end."""
+    """Setpoints are held within 0.10 m and 10 degrees for 10 s from 15 s on, always level; 1 cm and 1 degree
+    at the end."""
     log, _ = held(period=period, **water)
     assert (settling_time(log, period) < 15.0).all()
     assert np.abs(log[-1, :, :3]).max() < 0.01 and np.abs(log[-1, :, 3]).max() < math.radians(1.0)
@@ -123,7 +124,7 @@ def test_all_eight_setpoints_are_held_when_the_model_is_wrong(vehicle, pool, cha
 
 @pytest.mark.slow
 def test_all_eight_setpoints_are_held_with_noisy_measurements(vehicle, pool):
-    """Every sample has white noise of 2 cm, 2 degrees, 2 cm/s and 2 degrees/s."""
+    """Setpoints are held with white noise of 2 cm, 2 degrees, 2 cm/s and 2 degrees/s on every sample."""
     rng = np.random.default_rng(0)
 
     def noise(state):
@@ -147,7 +148,7 @@ def holds_a_pose(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in catalogue() if holds_a_pose(name)])
 def test_every_vehicle_that_can_hold_a_pose_holds_it(name, pool):
-    """From two body lengths away and turned by a radian or two, it holds the pose within 30 s."""
+    """From two body lengths away and turned by a radian or two, the vehicle holds the pose within 30 s."""
     craft = load_vehicle(name)
     away = 2.0 * craft.body.size[0] * np.array([[1.0, 0.5, -0.2], [-1.0, 0.3, 0.2]])
     start = np.array([0.0, 0.0, -10.0])

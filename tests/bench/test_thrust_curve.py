@@ -85,7 +85,7 @@ def test_an_empty_pulse_leaves_the_sign_to_the_force(tmp_path):
 
 @pytest.mark.parametrize("path", [AT_16_V, ALL_VOLTAGES], ids=lambda path: path.stem)
 def test_the_published_t200_tables_are_read_with_signs(path):
-    """The manufacturer prints speeds without sign; forward pulses give forward thrust."""
+    """Speeds, printed by the manufacturer without sign, get signs: forward pulses give forward thrust."""
     table = read_table(path)
     turning = table.speed != 0.0
     np.testing.assert_array_equal(np.sign(table.speed[turning]), np.sign(table.pulse[turning] - 1500.0))
@@ -152,8 +152,7 @@ def test_decimal_commas_and_a_line_of_units_are_understood(tmp_path, separator):
 
 
 def test_a_log_of_held_levels_gives_its_settled_parts(tmp_path):
-    """Levels last 5 s (facts §19: the last 2 s count), with a load cell that has an offset and a motor that
-    needs 0.3 s."""
+    """The last 2 s of levels of 5 s count (facts §19), with an offset load cell and a motor that needs 0.3 s."""
     rng = np.random.default_rng(1)
     levels = np.repeat([0, 800, 1400, 2000, 2600, 0, -800, -1400, -2000, -2600, 0], 100).astype(float)
     rpm = np.zeros_like(levels)
@@ -221,7 +220,7 @@ def test_the_interval_covers_the_truth(alike, least):
 
 
 def test_tables_that_disagree_widen_the_interval():
-    """The four thrusters of the group are consistent within themselves and 5 % apart from each other."""
+    """Four thrusters, each consistent but 5 % apart from each other, widen the interval of their group."""
     rng, omega = np.random.default_rng(4), np.linspace(30.0, 280.0, 60)
     tables = [
         (omega, c * omega**2 + 0.02 * rng.standard_normal(60))

@@ -28,7 +28,7 @@ for path in sys.argv[1:]:
 
 @pytest.mark.slow
 def test_every_benchmark_loads_and_answers_help():
-    """All run in one process, since most of the time is spent on shared imports."""
+    """Every benchmark prints its help, all in one process, since most of the time is spent on shared imports."""
     paths = sorted(map(str, BENCHMARKS.glob("*.py")))
     assert len(paths) > 20
     done = subprocess.run(

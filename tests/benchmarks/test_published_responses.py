@@ -54,7 +54,7 @@ def test_applied_is_what_the_thrusters_give(responses: dict[str, dict]) -> None:
 
 
 def test_another_model_gives_other_speeds(responses: dict[str, dict]) -> None:
-    """The result names the model."""
+    """Another model gives other speeds, and the result names it."""
     result = validate("finsrov", hydrodynamics="simplified")
     assert result["hydrodynamics"] == "simplified"
     assert [r["simulated"] for r in result["responses"]] != [r["simulated"] for r in responses.values()]

@@ -99,7 +99,7 @@ def test_objective_equals_that_of_lsq_linear(layout):
 
 @pytest.mark.parametrize("regularisation", [1e-6, 1e-3, 1e-1])
 def test_objective_equals_that_of_lsq_linear_for_any_regularisation(finsrov, regularisation):
-    """A small lambda makes the problem ill-conditioned (1e6 here), and float32 still solves it."""
+    """The objective equals lsq_linear's in float32, also for a small lambda, which is ill-conditioned (1e6 here)."""
     assert_as_good_as_lsq_linear(finsrov, wrenches(finsrov, 500, seed=3), regularisation)
 
 

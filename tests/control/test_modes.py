@@ -104,7 +104,7 @@ def thrusts_of_worlds(action: wp.array2d(dtype=vec8), data: ModeData, force: wp.
 
 @pytest.mark.parametrize("name", OWN)
 def test_a_batch_of_vehicles_and_the_robot_give_the_same_bits(name):
-    """The batch has every catalogue vehicle with the same number of thrusters, each with its own scale."""
+    """Results are bit-identical in a batch of all vehicles with as many thrusters, each with its own scale."""
     vehicles = [one for one in map(load_vehicle, catalogue()) if len(one.thruster_names) == 8]
     assert len(vehicles) > 3
     scales = [1.0 / (1 + v) for v in range(len(vehicles))]

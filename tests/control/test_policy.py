@@ -207,7 +207,7 @@ def test_a_bad_observation_is_refused_by_name(folder):
 
 
 def test_one_action_takes_microseconds(folder):
-    """A robot calls it with N = 1; processor time is measured, since the machine may be shared."""
+    """One action with N = 1, as on a robot, takes microseconds; processor time counts, as the machine may be shared."""
     policy, observation = Policy.load(folder), np.zeros(3, dtype=np.float32)
     durations = []
     for _ in range(500):
@@ -228,14 +228,14 @@ def test_running_a_policy_needs_no_torch(folder):
 
 
 def test_a_network_with_other_names_is_refused(folder):
-    """An input with another name would fail at the first action."""
+    """A network whose input has another name, which would fail at the first action, is refused."""
     write(folder, network().replace(b"observation", b"observatlon"))
     with pytest.raises(PolicyError, match="maps observatlon to action, expected observation to action"):
         Policy.load(folder)
 
 
 def test_a_network_that_takes_too_much_memory_is_refused(folder):
-    """The product of two weights of 400 kB has 10^10 elements."""
+    """A network that multiplies two weights of 400 kB into 10^10 elements is refused."""
     wide = numpy_helper.from_array(np.ones((100_000, 1), np.float32), "wide")
     nodes = [helper.make_node("MatMul", ["observation", "gain"], ["x"])]
     nodes += [

@@ -117,7 +117,7 @@ def test_the_published_name_of_the_broken_line_is_known():
 
 
 def test_a_vehicle_refuses_what_it_cannot_follow():
-    """FinsROV reaches 0.345 m/s sideways, and its pool ends at y = 1 m."""
+    """FinsROV refuses to exceed its 0.345 m/s sideways, and to leave its pool, which ends at y = 1 m."""
 
     def line(y, duration):
         _, motion = polyline([(0.0, 0.0, -0.5), (0.0, y, -0.5)], [duration])
@@ -143,7 +143,7 @@ def test_what_is_no_trajectory_is_refused():
 
 @EVERY
 def test_a_published_trajectory_grows_with_the_vehicle(name):
-    """Its path and its speed are scaled, not its duration; FinsROV's is the published one."""
+    """Path and speed are scaled with the vehicle, the duration is not; FinsROV's trajectory is the published one."""
     published, own = TRAJECTORIES[name], load_trajectory(name, vehicle=load_vehicle("rexrov"))
     t = np.linspace(0.0, published.duration, 50)
     for part in ("position", "velocity"):

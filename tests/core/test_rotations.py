@@ -45,7 +45,7 @@ def test_products_and_matrices_agree_with_scipy():
 
 
 def test_cross_is_numpys_to_the_last_digit():
-    """This holds for one pair, for many, and for shapes that broadcast."""
+    """The cross product equals NumPy's for one pair, for many, and for shapes that broadcast."""
     other = np.roll(VECTORS, 1, axis=0)
     assert np.array_equal(cross(VECTORS, other), np.cross(VECTORS, other))
     assert np.array_equal(cross(X, VECTORS[:5, None]), np.cross(X, VECTORS[:5, None]))
@@ -59,7 +59,7 @@ def test_euler_angles_agree_with_scipy():
 
 
 def test_matrices_come_back_as_the_same_quaternion():
-    """This includes half turns, where w = 0 and a formula that divides by it fails."""
+    """A quaternion survives conversion to a matrix and back, half turns with w = 0 included."""
     half_turns = np.array([[1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 1.0, 0], [0.6, 0.8, 0, 0], [0, 0, 0, 1.0]])
     np.testing.assert_allclose(matrix_to_quat(quat_to_matrix(half_turns)), half_turns, atol=1e-15)
     np.testing.assert_allclose(matrix_to_quat(RANDOM.as_matrix()), up_to_sign(Q), atol=1e-14)

@@ -30,7 +30,7 @@ def marks(folder):
 
 @pytest.mark.slow
 def test_results_come_in_the_order_of_the_jobs(tmp_path):
-    """The order does not depend on which process ended first."""
+    """Results have the order of the jobs, whichever process ended first."""
     results = run_jobs(JOBS, tmp_path, played.known, processes=2)
     assert [r["job"]["target"] for r in results] == ["P01", "P02", "P03"]
     assert [r["success"] for r in results] == [True, False, True]
@@ -72,7 +72,7 @@ def test_a_result_that_was_changed_is_not_gone_on_with(tmp_path):
 
 @pytest.mark.slow
 def test_a_trial_that_breaks_loses_no_other(tmp_path):
-    """Its error is raised; the earlier results stay complete."""
+    """The error of a broken trial is raised; the results so far stay complete."""
     with pytest.raises(RuntimeError, match="P02 broke"):
         run_jobs(JOBS, tmp_path, played.failing, processes=1)
     kept = [json.loads(path.read_text()) for path in tmp_path.glob("*.json")]
@@ -178,7 +178,7 @@ def test_a_stranger_at_the_address_of_a_cluster_is_found_out(monkeypatch, says, 
 
 @pytest.mark.parametrize("processes", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_further_jobs_are_prepared_while_others_are_played(tmp_path, processes):
-    """Their results follow, and a second call plays none of them again."""
+    """The results of jobs added later follow, and a second call plays none of them again."""
     shown = []
 
     def more():

@@ -138,7 +138,7 @@ def test_the_full_demonstration_tries_all_setpoints_and_axes():
 
 
 def test_the_report_loads_nothing(folder):
-    """It begins with a picture; pictures are embedded; there is no script, style sheet or address."""
+    """The report begins with a picture; pictures are embedded; there is no script, style sheet or address."""
     html = (folder / "report.html").read_text(encoding="utf-8")
     assert html.index("<figure>") < html.index('<p class="lead">') < html.index("<details")
     sources = re.findall(r'(?:src|href)="([^"]{0,30})', html)

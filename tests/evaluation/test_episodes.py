@@ -62,7 +62,7 @@ def test_each_world_counts_its_first_episode():
 
 
 def test_a_world_that_breaks_has_no_measures(monkeypatch, tmp_path):
-    """Neither its last return nor that of its next episode counts; the other worlds continue."""
+    """A broken world's last return and that of its next episode are not counted; the other worlds continue."""
     step = Environment.step
 
     def breaking(self, action):
@@ -110,7 +110,7 @@ def test_means_have_intervals_and_what_is_missing_is_counted():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["t3", "team-pursuit"])
 def test_baselines_are_evaluated_by_name(name, tmp_path, capsys):
-    """They give a table, JSON and a figure, with a row for each plant where there are two."""
+    """A baseline given by name yields a table, JSON and a figure, with a row for each plant where there are two."""
     who = next(iter(baselines_of(name)))
     assert agent_for(who, FINSROV, task_named(name)).describe()["kind"] == "baseline"
     words = ["evaluate", who, "--task", name, "--plant", "nominal", "--plant", "noise", "--trials", "2"]

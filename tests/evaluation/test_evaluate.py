@@ -138,7 +138,7 @@ def test_seeds_decide_what_is_drawn(monkeypatch):
 
 
 def test_json_is_one_object_with_the_agreed_keys(capsys, policy):
-    """Standard output contains nothing else, and every trial has its setpoint and measures."""
+    """Standard output contains only the object, and every trial has its setpoint and measures."""
     assert boundary.run(app, ["evaluate", str(policy), "--trials", "9", "--json"]) == 0
     printed = json.loads(capsys.readouterr().out)
     assert printed.keys() >= KEYS | {"provenance", "vehicle", "plant", "seed"}
@@ -194,7 +194,7 @@ def test_several_plants_are_one_table_one_object_and_one_directory(tmp_path, cap
 
 
 def test_a_world_that_breaks_fails_its_trial_alone(tmp_path, monkeypatch):
-    """From then on it has no numbers and no success; the other trials are unaffected."""
+    """After it breaks, a world has no numbers and no success; the other trials are unaffected."""
     step, calls = Environment.step, []
 
     def breaking(self, action):
@@ -223,7 +223,7 @@ def test_a_policy_for_another_vehicle_is_refused(tmp_path):
 
 
 def test_a_plant_may_change_what_a_policy_was_trained_for(policy, monkeypatch):
-    """This is the purpose of plants: the policy is checked against the vehicle's file."""
+    """A policy is checked against the vehicle's file, not against the plant, which may differ on purpose."""
     monkeypatch.setattr(trials_module, "DURATION", 1.0)
     heavy = PlantChanges(name="heavy", vehicle={"body.mass": 12.5})
     assert evaluate_controller(policy, heavy, TrialSettings(trials=1)).result["plant"]["vehicle"] == {
@@ -268,7 +268,7 @@ def test_a_policy_of_a_task_of_ones_own_asks_for_its_file(tmp_path, monkeypatch)
 
 
 def test_a_plant_that_cannot_name_a_folder_is_refused_among_several(tmp_path):
-    """Its trajectories would be written outside the output folder."""
+    """A plant whose trajectories would be written outside the output folder is refused."""
     for name in ("../x", "..", "", "/tmp/x", "a\\b", "c:", "a" * 300):
         (tmp_path / "plant.yaml").write_text(f"name: '{name}'\n", encoding="utf-8")
         with pytest.raises(EvaluationError, match="^plant '.*expected the plain name of a file or folder"):

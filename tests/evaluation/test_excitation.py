@@ -123,7 +123,7 @@ def test_a_programme_that_the_bridge_stops_is_left_out(tmp_path):
 
 
 def test_thrusters_carry_what_a_vehicle_is_too_light():
-    """They carry it all the time, and nothing if the vehicle is ballasted or not controlled in heave."""
+    """Thrusters balance missing weight all the time, and add nothing if ballasted or not controlled in heave."""
     programme = step(6.0)
     light = FINSROV.replace({"body.displaced_volume": FINSROV.body.displaced_volume + 2e-4})
     carried = trimmed(programme, light).tau_desired - programme.tau_desired
@@ -133,7 +133,7 @@ def test_thrusters_carry_what_a_vehicle_is_too_light():
 
 
 def test_excite_in_a_pool_by_command(tmp_path):
-    """It writes trials, records and their description; pool, vehicle and severity are those of the options."""
+    """The command writes trials, records and their description; pool, vehicle and severity are those of the options."""
     command = ["excite", "roll", "--vehicle", "finsrov", "--levels", "1.0", "--out", str(tmp_path / "t")]
     pool = ["--pool", "3", "--severity", "nominal", "--pool-vehicle", "finsrov_sim7", "--json"]
     done = CliRunner().invoke(app, [*command, *pool])
@@ -150,7 +150,7 @@ def test_excite_in_a_pool_by_command(tmp_path):
 
 
 def test_excite_plays_the_dive_that_a_report_recommends(tmp_path, capsys):
-    """The command plays it; other kinds and levels beside it are refused."""
+    """The command plays the recommended dive; other kinds and levels beside it are refused."""
     legs = [{"axis": "yaw", "level": 2.0, "hold": 1.5, "times": 2}]
     (tmp_path / "fit.json").write_text(json.dumps({"next_dive": {"legs": legs}}))
     command = ["excite", "all", "--vehicle", "finsrov", "--out", str(tmp_path / "t"), "--from", str(tmp_path)]
@@ -167,7 +167,7 @@ def test_a_pool_goes_with_no_other_simulation(tmp_path):
 
 @pytest.mark.parametrize("option", [["--severity", "hard"], ["--pool-vehicle", "bluerov2"]])
 def test_what_tells_of_a_pool_needs_one(tmp_path, option, capsys):
-    """Such options are refused, not ignored."""
+    """Options of a pool are refused without one, not ignored."""
     command = ["excite", "roll", "--vehicle", "finsrov", "--out", str(tmp_path / "t"), *option]
     assert boundary.run(app, command) == 2 and not (tmp_path / "t").exists()
     assert "--pool SEED" in capsys.readouterr().err

@@ -82,7 +82,7 @@ def test_a_record_of_the_experiment_is_measured_again_by_evaluate_and_by_a_truth
 
 
 def test_when_all_is_played_the_robot_is_not_opened(held):
-    """No robot answers at that address."""
+    """With all trials played, the robot is not opened: none answers at that address."""
     from finssim.robot.wiring import Wiring
 
     out, result, _, _ = held

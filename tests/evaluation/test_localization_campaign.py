@@ -35,14 +35,14 @@ def plain(thing):
 
 @pytest.mark.parametrize("name", CONDITIONS)
 def test_equal_seeds_give_equal_campaigns(name):
-    """They are equal number by number; another seed gives another campaign."""
+    """Campaigns of equal seeds are equal number by number; another seed gives another campaign."""
     one, same, other = (draw_campaign(CONDITIONS[name], seed, **SMALL) for seed in (4, 4, 5))
     assert plain(one) == plain(same)
     assert plain(one)["calibrates"] != plain(other)["calibrates"]
 
 
 def test_the_campaign_is_the_published_one():
-    """It has 170 places over the pool's middle, 720 pictures shared evenly, and 85 calibration places."""
+    """The campaign has 170 places over the pool's middle, 720 pictures shared evenly, and 85 calibration places."""
     campaign = draw_campaign(CONDITIONS["published"], 1)
     places = np.array([visit.nominal for visit in campaign.visits])
     assert len(places) == LOCATIONS[0] * LOCATIONS[1] == 170
@@ -54,7 +54,7 @@ def test_the_campaign_is_the_published_one():
 
 
 def test_the_camera_is_the_published_one():
-    """Every digit of its lens and its height above the water agree."""
+    """Every digit of the lens and the height above the water are as published."""
     camera = published_pool().camera
     assert (camera.lens.fx, camera.lens.fy) == (540.9305, 540.9305)
     assert (camera.lens.cx, camera.lens.cy) == (682.2341, 348.6136)
@@ -115,7 +115,7 @@ def test_errors_of_a_campaign_have_the_stated_spread():
 
 @pytest.mark.parametrize("name", [f.name for f in dataclasses.fields(Conditions)])
 def test_each_condition_alone_does_what_it_says(name):
-    """With all others zero, only its own error is present."""
+    """With all other errors zero, only that of the condition is present."""
     none = {field.name: 0.0 for field in dataclasses.fields(Conditions)}
     campaign = draw_campaign(Conditions(**{**none, name: 0.01}), 3, **SMALL)
     true = published_pool()
@@ -200,7 +200,8 @@ def test_calibration_looks_neither_at_the_truth_nor_at_held_out_visits(calibrate
 
 
 def test_calibration_is_near_the_truth_which_it_does_not_know(calibrated):
-    """Camera within 2 cm, its height above the water within 1 cm, water tilt within half a degree."""
+    """The camera is found within 2 cm, its height above the water within 1 cm, the water's tilt within half a
+    degree."""
     campaign, _, found = calibrated
     true, ours = campaign.truth, found.refractive
     assert np.linalg.norm(ours.camera.position - true.camera.position) < 0.02

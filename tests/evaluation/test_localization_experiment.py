@@ -78,7 +78,7 @@ def test_the_result_has_its_documented_parts(done):
 
 
 def test_refraction_wins_where_it_should(done):
-    """Its error is below 1 cm under every condition and at another depth, where straight lines with depth fail."""
+    """Refraction is below 1 cm under every condition and at another depth, where straight lines with depth fail."""
     _, result, _ = done
     for name, methods in result["results"].items():
         assert methods["refractive"]["rmse_cm"] < 1.0, name
@@ -103,7 +103,7 @@ def test_the_page_shows_the_same_figures(done):
 
 
 def test_progress_rises(done):
-    """It rises from zero, by seed and by condition."""
+    """Progress rises from zero, by seed and by condition."""
     _, _, said = done
     parts = [part for part, _ in said]
     assert parts == sorted(parts) and parts[0] == 0.0 and parts[-1] < 1.0
@@ -210,7 +210,7 @@ COMMAND = ["experiment", "localization", "--renderer", "geometry"]
 
 
 def test_the_command_runs_the_seeds_and_the_renderer_that_it_is_given(tiny, published_alone, tmp_path, capfd):
-    """It prints a table and the output path, or one JSON object with --json; standard error has only progress.
+    """The command prints a table and the output path, or a JSON object with --json; standard error has only progress.
 
     Equal seeds give the function's results, number by number, and its pool; other seeds give others.
     """
@@ -233,7 +233,7 @@ def test_the_command_runs_the_seeds_and_the_renderer_that_it_is_given(tiny, publ
 
 
 def test_the_command_draws_three_times_with_our_renderer_unless_told_otherwise(monkeypatch, tmp_path):
-    """These defaults are those of the help."""
+    """By default the command draws three campaigns with our renderer, as stated in the help."""
     given = {}
 
     def asked(**options):

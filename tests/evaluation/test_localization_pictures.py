@@ -75,7 +75,7 @@ def test_what_lies_outside_the_picture_is_not_detected():
 @pytest.mark.slow
 @pytest.mark.parametrize("renderer", ["own", "geometry"])
 def test_equal_seeds_give_equal_pictures(renderer):
-    """They are bit-identical, whatever was drawn before; another campaign has other noise."""
+    """Pictures of equal seeds are bit-identical, whatever was drawn before; another campaign has other noise."""
     campaign = some(draw_campaign(CONDITIONS["published"], 1, **SMALL), 3)
     one, same = (np.array([p.detection.corners for p in pictures(campaign, renderer)]) for _ in range(2))
     np.testing.assert_array_equal(one, same)

@@ -46,7 +46,7 @@ def test_without_errors_refraction_is_exact(exact, method):
 
 
 def test_straight_lines_with_depth_are_centimetres_off_even_then(exact):
-    """They use the true camera pose and ignore the water."""
+    """With the true camera pose, straight lines that ignore the water are centimetres off."""
     campaign, seen = exact
     dry = replace(campaign.truth, interface=replace(campaign.truth.interface, index_far=1.0003))
     assert locate(campaign, seen, dry, "pinhole-depth").rmse > 0.02
@@ -69,7 +69,7 @@ def test_refraction_with_depth_is_less_noisy_than_what_finds_the_depth_itself():
 
 
 def test_held_out_visits_alone_are_scored_each_once(published):
-    """Errors against the survey and against the truth differ by the survey's own error."""
+    """Held-out visits are scored once; errors against survey and truth differ by the survey's own error."""
     campaign, seen = published
     scores = locate(campaign, seen, campaign.truth, "refractive")
     np.testing.assert_array_equal(scores.visits, np.flatnonzero(~campaign.calibrates))
@@ -94,7 +94,7 @@ def test_pictures_of_a_visit_are_averaged(published):
 
 
 def test_refused_pictures_are_counted_by_their_reason(published):
-    """Examples are an undetected tag and one whose corners fit no pose."""
+    """An undetected tag, and one whose corners fit no pose, are counted by reason."""
     campaign, seen = published
     held_out = [p for p in seen if not campaign.calibrates[p.visit]]
     lost, broken, *rest = held_out
@@ -113,7 +113,7 @@ def score(errors, **more):
 
 
 def test_figures_are_pooled_over_visits():
-    """3-4-5 triangles check centimetres, root mean square, 95th percentile, and sums of counts and reasons."""
+    """3-4-5 triangles give the expected rms and 95th percentile in centimetres; counts and reasons are summed."""
     one = score([[0.03, 0.04], [0.0, 0.05]], reasons={"tag not detected": 1}, pictures=3)
     two = score([[0.06, 0.08]], reasons={"tag not detected": 2, "no": 1}, pictures=4)
     figures = pooled([one, two])
@@ -128,7 +128,7 @@ def test_figures_are_pooled_over_visits():
 @pytest.mark.slow
 @pytest.mark.parametrize("seeds", [1, 3, 10])
 def test_intervals_contain_the_estimate_and_are_repeatable(seeds):
-    """They also shrink with more visits of the same errors."""
+    """Intervals contain the estimate, are repeatable, and shrink with more visits of the same errors."""
     rng = np.random.default_rng(seeds)
     drawn = [rng.normal(0.0, 0.01, (20, 2)) for _ in range(seeds)]
     few, many = [score(e) for e in drawn], [score(np.tile(e, (16, 1))) for e in drawn]
@@ -144,7 +144,7 @@ def test_intervals_contain_the_estimate_and_are_repeatable(seeds):
 
 
 def test_seeds_that_disagree_widen_the_interval():
-    """The same errors are divided between seeds evenly or by size."""
+    """The interval is wider if the same errors are divided between seeds by size instead of evenly."""
     small, large = np.full((50, 2), 0.001), np.full((50, 2), 0.01)
     mixed = [score(np.vstack([small[::2], large[::2]])) for _ in range(2)]
     apart = [score(small), score(large)]
@@ -156,7 +156,7 @@ def test_seeds_that_disagree_widen_the_interval():
     "empty", [[score([])], [score([]), score([[0.03, 0.04]])]], ids=["all", "one of two"]
 )
 def test_where_nothing_was_located_there_is_no_figure(empty):
-    """The empty case raises no error and gives valid JSON."""
+    """Without located pictures there is no figure, no exception, and valid JSON."""
     figures = pooled(empty)
     json.dumps(figures, allow_nan=False)
     if len(empty) == 1:
@@ -167,7 +167,7 @@ def test_where_nothing_was_located_there_is_no_figure(empty):
 
 @pytest.mark.parametrize(("offset", "sign"), [(0.05, 1.0), (-0.05, -1.0)])
 def test_a_depth_read_too_deep_puts_the_tag_too_far_out(exact, offset, sign):
-    """The shift is along the ray in the water: tan of its angle there, outwards from the point below the camera."""
+    """The tag moves outwards from the point below the camera, by tan of the ray's angle in the water."""
     campaign, seen = exact
     visits = tuple(replace(visit, depth_read=visit.depth_read + offset) for visit in campaign.visits)
     scores = locate(replace(campaign, visits=visits), seen, campaign.truth, "refractive")

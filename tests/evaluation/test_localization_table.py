@@ -70,7 +70,7 @@ def printed(result, width=100):
 
 
 def test_every_figure_of_every_method_is_shown(result):
-    """Each appears under its conditions, with its interval and number of located pictures, and on the page."""
+    """Each figure appears under its conditions, with its interval and number of located pictures, and on the page."""
     text, page = printed(result), markdown_of(tables_of(result))
     for k in range(len(METHOD_TITLES)):
         for cell in (f"{1 + k:.2f}", f"[{0.875 + k:.2f}, {1.125 + k:.2f}]", f"{2 + 2 * k:.2f}"):

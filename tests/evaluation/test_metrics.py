@@ -39,7 +39,7 @@ def test_constant_errors_are_their_own_rms():
 
 
 def test_errors_before_the_window_do_not_count():
-    """The vehicle is 5 m away until 39.9 s, and at the goal from 40 s on."""
+    """An error of 5 m until 39.9 s does not count if the vehicle is at the goal from 40 s on."""
     measures = measure_trial(*trial(lambda t: (np.where(t < 39.95, 5.0, 0.0), 0.0, 0.0), np.zeros_like), GOAL)
     assert measures["e_p_m"] == pytest.approx(0.0, abs=1e-12)
     assert measures["t_s_s"] == pytest.approx(40.0)
@@ -106,7 +106,7 @@ def test_a_gap_in_the_samples_breaks_the_hold():
 
 
 def test_a_trial_that_ends_early_has_no_late_errors():
-    """It may have held for 10 s before; without samples there is no measure at all."""
+    """A trial that ends early may have held for 10 s before; without samples there is no measure at all."""
     measures = measure_trial(*trial(nowhere, np.zeros_like, duration=30.0), GOAL)
     assert measures["success"] and measures["e_p_m"] is None and measures["valid"] == 0.0
     empty = measure_trial(np.empty(0), np.empty((0, 3)), np.empty(0), GOAL)

@@ -69,20 +69,19 @@ def begins(exact, off, turn_deg, speed, rate_deg, site="pool"):
 
 @pytest.mark.parametrize("exact", [True, False])
 def test_a_vehicle_at_rest_at_its_start_begins_after_two_seconds(exact):
-    """At rest means within 10 cm and 10°, slower than 5 cm/s and 5°/s."""
+    """A vehicle within 10 cm and 10°, slower than 5 cm/s and 5°/s, begins after two seconds."""
     assert begins(exact, 0.05, 5.0, 0.02, 2.0) == pytest.approx(2.0)
 
 
 def test_one_that_circles_its_start_begins_where_it_need_not_be_exact():
-    """12° off at 17°/s, as with a PID tuned from guesses, it begins after 10 s, and never if the start must
-    be exact."""
+    """A vehicle 12° off at 17°/s, as with a PID tuned from guesses, begins after 10 s, but never at an exact start."""
     assert begins(False, 0.05, 12.0, 0.02, 17.0) == pytest.approx(10.0)
     assert begins(True, 0.05, 12.0, 0.02, 17.0) is None
 
 
 @pytest.mark.parametrize("far", [(0.2, 0.0, 0.0, 0.0), (0.0, 25.0, 0.0, 0.0), (0.0, 0.0, 0.15, 0.0)])
 def test_one_that_is_farther_off_never_begins(far):
-    """The limits are 15 cm, 20° and 10 cm/s."""
+    """Beyond 15 cm, 20° or 10 cm/s the trial never begins."""
     assert begins(False, *far) is None
 
 

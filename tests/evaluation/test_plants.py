@@ -22,8 +22,8 @@ OPEN_LOOP = [name for name, kind in MODES.items() if not kind.pilot and not kind
 
 
 def test_the_plants_of_the_protocol_ship():
-    """They are nominal, randomised, foreign, held out, current, waves, noise, sensors, lag, and the other two
-    models."""
+    """The shipped plants are nominal, randomised, foreign, held out, current, waves, noise, sensors, lag, and the
+    other two models."""
     expected = [
         "beyond_cruise",
         "current",

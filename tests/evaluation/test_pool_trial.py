@@ -32,7 +32,7 @@ def played(tmp_path_factory):
 
 
 def test_a_trial_starts_at_the_published_pose_and_goes_to_its_setpoint(played):
-    """The estimate is within centimetres of the truth."""
+    """From the published pose to the setpoint, the estimate is within centimetres of the truth."""
     result, series = played()
     assert result["fault"] == "" and result["missed_decisions"] == 0
     np.testing.assert_allclose(series.position[0], T1_START[:3], atol=0.06)
@@ -42,7 +42,7 @@ def test_a_trial_starts_at_the_published_pose_and_goes_to_its_setpoint(played):
 
 
 def test_equal_jobs_give_equal_results(played, tmp_path):
-    """They are equal to the last digit in another call."""
+    """A job that is played again gives equal results to the last digit."""
     again = play(SHORT, tmp_path / "again")
     told = ("localization", "success", "t_s_s", "valid")
     assert {key: again[key] for key in told} == {key: played()[0][key] for key in told}
@@ -64,7 +64,7 @@ def test_equal_jobs_give_equal_results(played, tmp_path):
     ids=lambda change: next(iter(change)),
 )
 def test_every_field_of_a_job_changes_the_motion(played, change):
-    """No field is merely recorded."""
+    """Every field of a job has an effect; none is merely recorded."""
     assert not np.array_equal(played(duration=2.0, **change)[1].position, played(duration=2.0)[1].position)
 
 
@@ -118,7 +118,7 @@ def test_a_robot_in_a_tank_may_go_where_the_tank_is(tmp_path):
 
 @pytest.mark.slow
 def test_an_autopilot_that_locates_itself_holds_its_setpoint(tmp_path, monkeypatch):
-    """Without a Doppler log on the robot's link, it is within 8 cm of the truth from 20 to 30 s."""
+    """Without a Doppler log on the link, the vehicle is within 8 cm of the truth from 20 to 30 s."""
     monkeypatch.setattr(metrics, "EVALUATION_WINDOW", (20.0, 30.0))
     job = RobotJob(row="pid", controller="pid", target="P01", vehicle="bluerov2_heavy", pool_vehicle="bluerov2_heavy",
               plant=2, severity="realistic", seed=1, site="tank", firmware="ardusub-own", duration=30.0)  # fmt: skip

@@ -69,7 +69,7 @@ def test_an_excitation_ends_where_its_room_does():
 
 
 def test_a_coast_ends_after_a_steady_rise():
-    """A rise of 0.02 m/s for 0.2 s ends it, at thresholds of 0.01 m/s and 0.2 s; an interrupted rise counts anew."""
+    """0.02 m/s for 0.2 s ends the coast, at thresholds of 0.01 m/s and 0.2 s; an interrupted rise counts anew."""
     pilot = ProgrammePilot(surge(ascent_speed=0.01, ascent_time=0.2), VEHICLE, hold=None)
     for t, w, phase in (
         (1.2, 0.02, "coast"),

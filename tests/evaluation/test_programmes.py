@@ -13,7 +13,7 @@ from reference.cases import THRUSTED
 
 @pytest.mark.parametrize("name", THRUSTED)
 def test_a_vehicle_is_driven_as_fast_as_finsrov_or_as_fast_as_it_stays_upright(name):
-    """Levels scale with its length, on the axes that it controls, within its limits; yaw has FinsROV's rate."""
+    """Levels scale with the vehicle's length, on controlled axes, within limits; yaw has FinsROV's rate."""
     vehicle, finsrov = load_vehicle(name), load_vehicle("finsrov")
     ours, theirs, levels = axis_model(vehicle), axis_model(finsrov), matched(FULL.levels, vehicle)
     assert set(levels) == set(vehicle.controlled_axes)
@@ -33,7 +33,7 @@ def test_a_vehicle_is_driven_as_fast_as_finsrov_or_as_fast_as_it_stays_upright(n
 
 
 def test_finsrov_has_its_own_levels():
-    """The levels agree to the last digit."""
+    """FinsROV gets the published levels unchanged, to the last digit."""
     assert matched(FULL.levels, load_vehicle("finsrov")) == FULL.levels
 
 

@@ -96,7 +96,7 @@ def test_only_what_the_operator_did_with_an_armed_and_located_vehicle_counts(tmp
 
 
 def test_a_blink_between_two_decisions_ends_a_stretch(tmp_path):
-    """One step of the loop in hold, without a decision, suffices."""
+    """One step of the loop in hold, without a decision, ends a segment."""
     path = written(
         tmp_path / "a.mcap", period=6, state=lambda t: "hold" if abs(t - 0.95) < 0.5 * STEP else "armed"
     )
@@ -175,7 +175,7 @@ def load_steps(path, out):
 
 
 def test_the_command_takes_several_records(tmp_path, capsys):
-    """The yield of each is reported; options of an expert are refused."""
+    """The command reports the yield of each record; options of an expert are refused."""
     paths = [str(written(tmp_path / f"{name}.mcap", 0.6)) for name in ("a", "b")]
     words = ["collect", *paths, "--task", "t1", "--out", str(tmp_path / "set")]
     assert boundary.run(app, [*words, "--json"]) == 0
@@ -195,7 +195,7 @@ def test_the_command_takes_several_records(tmp_path, capsys):
 
 @pytest.mark.parametrize("name", ["{}/theirs.csv", "theirs.csv", "theirs", "/theirs"])
 def test_the_trajectory_that_a_record_names_is_no_file(tmp_path, monkeypatch, name):
-    """Only the user names files, by --goal."""
+    """A trajectory name in a record is never opened as a file; only the user names files, by --goal."""
     (tmp_path / "theirs.csv").write_text("t,x,y,z\n0,0,0,-0.5\n9,1,0,-0.5\n", encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     told = name.format(tmp_path)

@@ -95,7 +95,7 @@ def test_what_the_pilot_saw_and_said_is_what_is_shown(shown):
 
 
 def test_a_clone_of_the_run_goes_the_same_way(shown):
-    """At rest and level, half a metre from its goal, it pushes towards the goal along surge, sway and heave."""
+    """At rest and level, half a metre from its goal, the clone pushes towards it along surge, sway and heave."""
     _, _, place = shown
     kind = learner_named("bc")
     environment = make("t1", worlds=4, seed=1)

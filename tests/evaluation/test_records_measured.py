@@ -78,7 +78,7 @@ def captured(path, truth, late):
 
 
 def test_the_truth_gives_the_measures_of_the_true_motion(held):
-    """They equal those with the known clock; the estimated offset is within a step of the search."""
+    """Measures equal those with the known clock; the estimated offset is within a step of the search."""
     record, truth, started = held
     trial = read_record(record, "t1", FINSROV, truth=truth)
     measures, found = trial.scores("t1", FINSROV), read_truth(truth)
@@ -112,7 +112,8 @@ def test_a_table_on_another_clock_is_laid_over_the_record(held, tmp_path):
 
 
 def test_evaluate_takes_a_record_and_prints_what_it_prints_of_a_simulation(held, tmp_path, capsys):
-    """It prints the setpoint by its published name, the paper's row beneath, one JSON object, and the figure."""
+    """`evaluate` prints the setpoint by its published name, the paper's row beneath, one JSON object, and the
+    figure."""
     record, truth, _ = held
     words = ["evaluate", str(record), "--task", "t1", "--truth", str(truth)]
     assert boundary.run(app, [*words, "--out", str(tmp_path / "out")]) == 0
@@ -140,7 +141,7 @@ def test_a_run_that_ended_early_is_named_and_has_no_late_errors(tmp_path, capsys
 def test_a_record_of_a_vehicle_of_ones_own_is_measured_by_the_file_that_it_keeps(
     tmp_path, capsys, monkeypatch
 ):
-    """This works without --vehicle, from another directory and without the file; a missing vehicle is named."""
+    """A record is measured without --vehicle, from another directory, without the file; a missing vehicle is named."""
     own = tmp_path / "minnow.yaml"
     own.write_text("extends: finsrov\norigin: measured\nsource: test\nbody: {mass: 13.0}\n")
     minnow = load_vehicle(own)

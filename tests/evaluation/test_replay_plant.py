@@ -57,7 +57,7 @@ def test_propellers_take_thrust_from_their_neighbours_and_from_their_own_motion(
 @pytest.mark.slow
 @pytest.mark.parametrize(("axis", "level"), [("surge", 12.0), ("sway", 9.0), ("heave", 9.0), ("yaw", 1.2)])
 def test_the_total_drag_is_within_a_quarter_of_the_published(axis, level):
-    """The steady speed at the middle published level is compared with that of d1 v + d2 v² = level."""
+    """At the steady speed, the published drag d1 v + d2 v² is within a quarter of the applied middle level."""
     plan = programmes(axis, FINSROV, levels=[level])[:1]
     recording = PLANT.record(plan, FINSROV, seed=1)
     k = ("surge", "sway", "heave", "roll", "pitch", "yaw").index(axis)

@@ -58,7 +58,7 @@ def printed(tables):
 
 @pytest.mark.parametrize("plants", [1, 2])
 def test_station_keeping_shows_every_unit_and_digit(plants):
-    """Rich would interpret `[m]` as a style and omit it."""
+    """Every unit and digit is shown, although Rich would interpret `[m]` as a style and omit it."""
     text = printed(tables_of({"plants": [result(T1_FIGURES, setpoint="P01")] * plants}))
     units = [heading.split(" [")[1] for heading, _ in T1_COLUMNS.values() if " [" in heading]
     assert [text.count(f"[{unit}") >= units.count(unit) for unit in units] == [True] * len(units)
@@ -68,7 +68,7 @@ def test_station_keeping_shows_every_unit_and_digit(plants):
 
 
 def test_tracking_shows_every_unit_and_digit():
-    """The same holds for T2."""
+    """The table of T2 shows every unit and digit."""
     text = printed(tables_of(result(T2_FIGURES, "t2", trajectory="lemniscate")))
     assert all(word in text for heading, _ in T2_COLUMNS.values() for word in heading.split())
     assert "…" not in text and all(

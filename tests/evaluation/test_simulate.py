@@ -35,7 +35,7 @@ def test_the_recorded_speed_is_the_terminal_one(tmp_path):
 
 
 def test_the_table_is_complete(tmp_path):
-    """It has one row per control step from rest, with SI units, a unit quaternion and every thruster by name."""
+    """The table has one row per control step from rest, with SI units, a unit quaternion and every thruster by name."""
     table = run(tmp_path / "run.csv")
     vehicle = load_vehicle("finsrov")
     np.testing.assert_allclose(table["t"], np.arange(21) * 0.1)
@@ -86,7 +86,7 @@ def test_every_model_moves_forward(tmp_path, model):
     ],
 )
 def test_what_cannot_be_simulated_is_refused(tmp_path, changes, error, sentence):
-    """One sentence refuses it, and no file is written."""
+    """An impossible simulation is refused in one sentence, and no file is written."""
     out = changes.get("out", tmp_path / "run.csv")
     with pytest.raises(error, match=sentence):
         run(out, **{name: value for name, value in changes.items() if name != "out"})

@@ -129,7 +129,7 @@ def two_machines():
 
 
 def test_a_table_without_a_policy_shows_the_errors():
-    """In this case every training failed."""
+    """If every training failed, the table shows the errors."""
     row = {"name": "run", "seed": 1, "run": "run-seed1", "options": {}, "error": "TrainingError: no"}
     (table,) = command.tables_of({"rows": [row]})
     assert table.rows == [["run", "1", "–", "–", "TrainingError: no"]] and len(table.heads) == 5
@@ -164,7 +164,7 @@ def test_an_experiment_trains_and_plays_on_a_cluster(tmp_path, two_machines, mon
     [("127.0.0.1:9", "no Ray cluster answers at 127.0.0.1:9"), ("here", "expected HOST:PORT or auto")],
 )
 def test_where_nobody_answers_is_told(tmp_path, sweep_file, address, sentence):
-    """It is refused at once in one sentence, and nothing is written."""
+    """An address without a cluster is refused at once in one sentence, and nothing is written."""
     with pytest.raises(ClusterError, match=sentence):
         command.sweep(sweep_file, out=tmp_path / "out", address=address)
     assert not (tmp_path / "out").exists()
@@ -210,7 +210,7 @@ def test_trainings_on_a_lost_machine_resume_from_their_checkpoints(
 
 
 def test_an_interrupted_training_of_several_processes_begins_anew(tmp_path, monkeypatch):
-    """Its checkpoints contain only the state of the first process, and `train` refuses to resume from them."""
+    """Checkpoints contain only the state of the first process, and `train` refuses to resume from them."""
     called = []
     monkeypatch.setattr(transfer, "train", lambda *_, resume=False, **__: called.append(resume))
     (tmp_path / "run-training").mkdir()
@@ -221,7 +221,7 @@ def test_an_interrupted_training_of_several_processes_begins_anew(tmp_path, monk
 
 @pytest.mark.slow
 def test_an_interrupted_training_resumes_from_its_checkpoint(tmp_path):
-    """On this machine, its checkpoints are beside the policy and are removed at the end."""
+    """On this machine, checkpoints of the training are beside the policy and are removed at the end."""
     policy, settings = tmp_path / "run", TrainingSettings(worlds=16, steps=4 * 4096)
 
     def interrupt(checkpoint):

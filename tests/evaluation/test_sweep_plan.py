@@ -46,7 +46,7 @@ def test_a_number_of_seeds_counts_from_one(tmp_path):
 
 
 def test_files_are_relative_to_the_sweep(tmp_path):
-    """This holds for vehicle, ranges and plants; workers receive the full paths."""
+    """Paths of vehicle, ranges and plants are relative to the sweep; workers receive the full paths."""
     for name in ("mine.yaml", "water.yaml"):
         (tmp_path / name).write_text("{}", encoding="utf-8")
     changes = {

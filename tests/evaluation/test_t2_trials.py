@@ -44,7 +44,8 @@ def nominal(tmp_path_factory):
 
 
 def test_the_pid_follows_the_published_trajectories_within_a_centimetre(nominal):
-    """This is in the nominal plant; the eight, which begins with a velocity jump from rest, has the largest error."""
+    """Errors are below 1 cm (1 mm vertically) in the nominal plant; most on the eight, which begins with a
+    velocity jump."""
     _, result = nominal
     for row in result["per_trial"]:
         name = row["trajectory"]
@@ -101,7 +102,7 @@ def test_a_feed_forward_of_acceleration_halves_the_error():
 
 
 def test_the_published_baseline_has_a_profile_for_trajectories():
-    """As published, T2 has other gains; its errors are the centimetres to decimetres that the paper reports."""
+    """As published, T2 has other gains; errors are the centimetres to decimetres that the paper reports."""
     assert controller_for("t2", "pid-paper", FINSROV).profile == TRAJECTORY_PROFILE
     assert controller_for("t1", "pid-paper", FINSROV).profile == PAPER_PROFILE
     player = agent_for("pid-paper", FINSROV, TASK)
@@ -121,7 +122,7 @@ def test_the_figure_has_a_row_for_each_trajectory():
 
 
 def test_the_papers_table_is_transcribed_whole():
-    """It has three controllers on four trajectories; the best horizontal error on each is that of + DR."""
+    """The table has three controllers on four trajectories; the best horizontal error on each is that of + DR."""
     assert set(PAPER_T2) == {"calibrated + DR", "calibrated", "PID"}
     for name in T2_TRAJECTORIES:
         best = min(PAPER_T2[kind][name][0] for kind in PAPER_T2)

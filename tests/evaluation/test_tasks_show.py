@@ -24,7 +24,7 @@ def finssim(*words):
 
 
 def test_every_task_is_listed(capsys):
-    """Each is listed by name, with its goal and its baseline."""
+    """Each task is listed by name, with its goal and its baseline."""
     assert finssim("tasks") == 0
     out = capsys.readouterr().out
     assert all(name in out for name in TASKS.usable())
@@ -34,7 +34,7 @@ def test_every_task_is_listed(capsys):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", (*TASKS, f"{EXAMPLE}:KeepDepth", f"{WARP_EXAMPLE}:KeepDepth"))
 def test_rewards_ends_and_totals_are_told_in_words(name):
-    """Each is a sentence, without source code."""
+    """Rewards, ends and totals are each a sentence, without source code."""
     told = describe_task(name)
     for one in (*told["reward"]["terms"], *told["ends"], *told["totals"]):
         assert one["meaning"].endswith("."), one
@@ -79,7 +79,7 @@ def test_a_task_is_shown_for_a_vehicle(capsys):
 
 
 def test_a_task_of_ones_own_is_shown(capsys):
-    """It is given by file and class; its own words replace the weights."""
+    """A user's task is given by file and class; its own words replace the weights."""
     assert finssim("tasks", "show", f"{EXAMPLE}:KeepDepth") == 0
     out = capsys.readouterr().out
     assert "keep-depth: Reach a depth" in out and "baselines: none" in out and "a slope near the depth" in out

@@ -36,7 +36,7 @@ def small(brief_t1, tmp_path_factory):
 
 
 def test_the_tuned_pid_holds_a_setpoint_of_the_pool(small):
-    """The row shows it with an interval of its single cluster."""
+    """The setpoint is held, and the row shows it with an interval of its single cluster."""
     out, result = small
     row = result["rows"]["pid"]
     assert (row["success"], row["trials"], row["stopped"], row["worst_success"]) == (1, 1, 0, 1)
@@ -77,14 +77,14 @@ def test_the_table_stands_beside_the_papers(small):
     ],
 )
 def test_what_is_unknown_is_refused_before_anything_is_trained(tmp_path, wrong, words):
-    """One sentence refuses it and lists the known names."""
+    """An unknown name is refused in one sentence that lists the known ones."""
     with pytest.raises(ValueError, match=words):
         experiment(tmp_path, **wrong)
     assert not list(tmp_path.iterdir())
 
 
 def test_a_finished_policy_is_not_trained_again(tmp_path):
-    """An unfinished policy is."""
+    """A finished policy is kept; an unfinished one is trained."""
     rows = {name: T1.rows[name] for name in ("pid", "calibrated-pool")}
     controllers = controllers_of("t1", rows, [5], tmp_path, TrainingSettings(steps=4096))
     network = Path(controllers["calibrated-pool", 5]) / "policy.onnx"
@@ -99,7 +99,7 @@ def test_a_finished_policy_is_not_trained_again(tmp_path):
 
 @pytest.mark.parametrize("spec", [T1, T2], ids=lambda spec: spec.name)
 def test_every_row_can_be_played(spec):
-    """It names an existing PID or training, and its paper row exists."""
+    """Each row names an existing PID or training, and its paper row exists."""
     for row in spec.rows.values():
         assert bool(row.controller) != (row.training is not None)
         if row.paper is not None:
@@ -135,7 +135,7 @@ def test_differences_are_means_over_pairs():
 
 
 def test_the_differences_say_which_way_each_row_moves(small):
-    """The paper's difference is shown beside, where it has one."""
+    """The paper's difference is shown beside each row's, where the paper has one."""
     _, result = small
     d = {"value": 0.03, "ci95": [0.02, 0.04], "count": 9}
     differences = {"calibrated": {"no-fusion": {"success_rate": None, "e_p_m": d, "e_psi_deg": d}}}

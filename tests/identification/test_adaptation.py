@@ -137,7 +137,7 @@ def test_a_sudden_change_is_followed_at_once():
 
 @pytest.mark.slow
 def test_the_adapted_vehicle_moves_as_the_changed_one():
-    """Its forces are those of the changed plant: volume and centre, thrust, drag; all other values are unchanged."""
+    """Forces are those of the changed plant: volume and centre, thrust, drag; all other values are unchanged."""
     adapted = followed(driven(payload), driven(payload, seed=2)).adapted
     weight = (VEHICLE.body.displaced_volume - adapted.body.displaced_volume) * GRAVITY
     assert weight == pytest.approx(6.0, abs=0.6)

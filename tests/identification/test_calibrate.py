@@ -96,7 +96,7 @@ def test_calibrations_follow_each_other(tmp_path):
 
 
 def test_equal_fits_make_equal_files(tmp_path):
-    """They contain no clock time."""
+    """Files of equal fits are equal, since they contain no clock time."""
     for name in ("a.yaml", "b.yaml"):
         write_vehicle(calibrated(made_fit()), tmp_path / name)
     assert (tmp_path / "a.yaml").read_bytes() == (tmp_path / "b.yaml").read_bytes()
@@ -117,7 +117,7 @@ def test_estimates_that_no_vehicle_can_have_are_refused():
 
 
 def test_an_unphysical_vehicle_is_reported():
-    """Damping that adds energy is a finding that its parent did not have."""
+    """Damping that adds energy is a finding, which the parent vehicle did not have."""
     fit = made_fit(
         changes={f"{SET}.linear_damping.1.1": -4.0}, quality={"sway": {"r2": -0.5}, "surge": {"r2": 0.9}}
     )

@@ -42,7 +42,7 @@ def test_the_rule():
     ],
 )
 def test_factors_are_possible_whatever_the_interval(estimate, ci95, expected):
-    """The cases are very narrow, across zero, very wide, around zero, and unknown intervals."""
+    """Factors are possible for intervals that are very narrow, across zero, very wide, around zero, or unknown."""
     one = Estimate(
         name="sway.d1",
         estimate=estimate,

@@ -332,7 +332,7 @@ def test_a_real_release_is_found_and_fitted():
 
 @pytest.mark.slow
 def test_surge_and_sway_are_judged_by_a_coordinate_each():
-    """Motion capture gives no u and v, and x would be used for both."""
+    """Each has its own coordinate: motion capture gives no u and v, and x would be used for both."""
     fit = fit_by_simulation([hinsdale("traj005-1")], HEAVY, axes=["surge", "sway"])
     assert [curve.y_label for curve in fit.curves] == ["x [m]", "y [m]"]
 

@@ -57,8 +57,7 @@ def by_sticks(joystick):
 
 @pytest.mark.slow
 def test_sticks_and_motion_capture_at_5_hz(joystick, by_sticks):
-    """Fitted at a quarter of the sticks' range and replayed at twice that: below 0.04, and better than the
-    catalogue."""
+    """A fit at a quarter of the sticks' range replays twice that below 0.04, better than the catalogue."""
     vehicle, fit, (_, held) = load_vehicle("bluerov2_heavy"), by_sticks, joystick
     found, before = scores(calibrated(fit), held), scores(vehicle, held)
     assert max(found[axis] for axis in ("surge", "sway", "yaw", "heave")) < 0.04, found
@@ -112,8 +111,7 @@ def test_pulses_and_an_imu_without_any_velocity(tmp_path):
 
 @pytest.mark.slow
 def test_a_heading_that_decays(tmp_path):
-    """Spun by hand with unknown inertia, it gives quadratic drag over inertia, with an interval; an inertia
-    scales it."""
+    """Spun by hand with unknown inertia, a vehicle shows quadratic drag over inertia; an inertia scales it."""
     vehicle = load_vehicle("bluerov2")
     trials = read(["*.csv"], "decay.yaml", "yaw_decay", tmp_path)
     options = {"held_out": trials[:1]}  # a fit that replays worse is tested below
@@ -136,7 +134,7 @@ def test_a_heading_that_decays(tmp_path):
 
 @pytest.mark.slow
 def test_a_fit_is_judged_by_what_was_not_fitted(tmp_path):
-    """The data are segments left out in turn, or held-out trials; the file keeps an axis that it predicts better."""
+    """A fit is scored on segments left out or on held-out trials; the file keeps an axis that it predicts better."""
     vehicle = load_vehicle("bluerov2")
     slow = read(["spin_[1-3].csv"], "decay.yaml", "yaw_decay", tmp_path)
     words = []

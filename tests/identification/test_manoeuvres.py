@@ -71,7 +71,8 @@ def test_a_factor_moves_a_parameter_of_every_actuator_of_a_kind():
 
 @pytest.mark.slow
 def test_a_manoeuvre_begins_at_speed_and_ends_in_a_stop():
-    """It begins at the speed of the first order; while the propeller stands still, the fins keep their angle."""
+    """The motion begins at the speed of the first order; while the propeller stands still, the fins keep
+    their angle."""
     stop = Manoeuvre(
         name="stop",
         axes=("surge", "yaw"),
@@ -92,7 +93,7 @@ def test_a_manoeuvre_begins_at_speed_and_ends_in_a_stop():
 
 @pytest.mark.slow
 def test_a_vehicle_that_turns_over_gives_no_trial():
-    """REMUS with a third of its lift is not stable under the autopilot of its file."""
+    """REMUS with a third of its lift, which the autopilot of its file cannot hold, gives no trial."""
     vehicle = load_vehicle("remus100")
     weak = vehicle.replace({f"actuators.{name}.lift_slope": 1.0 for name in vehicle.actuators})
     (dive,) = (one for one in manoeuvres(vehicle) if one.name == "dives_slow")

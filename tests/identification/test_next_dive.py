@@ -41,7 +41,7 @@ def test_a_designed_second_dive_halves_what_a_repeated_one_leaves():
 
 
 def test_a_fit_without_thrust_designs_nothing():
-    """Without known thrust, the effect of steps cannot be predicted."""
+    """A fit without thrust designs no dive, since the effect of steps cannot be predicted."""
     from identification.test_free_motion import ROV, coasts
 
     trials = coasts(np.random.default_rng(1), 0.1, 0.5, count=2, column="r", noise=0.01)

@@ -123,7 +123,7 @@ def test_what_tilts_a_vehicle_at_rest_turns_it_once_it_rolls():
 
 
 def test_a_set_without_coefficients_is_refused():
-    """A mesh has no damping coefficients to fit."""
+    """A mesh, which has no damping coefficients to fit, is refused."""
     sets = VEHICLES["finsrov"].hydrodynamics
     bare = VEHICLES["finsrov"].model_copy(update={"hydrodynamics": {"calibrated": sets["mesh"]}})
     with pytest.raises(CalibrationError, match="no coefficients in hydrodynamics.calibrated"):

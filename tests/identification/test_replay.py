@@ -158,7 +158,7 @@ def test_every_kind_of_input_drives_the_replay(inputs):
 
 
 def test_a_passive_trial_is_replayed_from_its_initial_state():
-    """With thrusters off, it is a free decay in roll and pitch from the initial tilt."""
+    """With thrusters off, the replay is a free decay in roll and pitch from the initial tilt."""
     (trial, _) = make("roll", spread=5.0)
     rows = trial.t < 2.0
     passive = dataclasses.replace(
@@ -177,7 +177,7 @@ def test_a_passive_trial_is_replayed_from_its_initial_state():
 
 
 def test_a_diverging_model_has_no_aggregate_and_says_so(surge):
-    """Damping that adds energy accelerates the body without end."""
+    """Damping that adds energy accelerates the body without end, which is reported."""
     broken = FINSROV.replace({"hydrodynamics.calibrated.quadratic_damping": [-1e4, 0, 0, 0, 0, 0]})
     found = replay(surge, broken)
     total = found.aggregate("calibrated")

@@ -39,7 +39,8 @@ def test_the_page_loads_nothing(folder):
 
 
 def test_a_reader_finds_what_they_need(folder):
-    """It contains estimates with intervals, kept values, warnings, trials by digest, and the command to repeat it."""
+    """The page contains estimates with intervals, kept values, warnings, trials by digest, and the command to
+    repeat it."""
     text = (folder / "report.html").read_text(encoding="utf-8")
     vehicle = calibrated(made_fit())
     for words in (
@@ -116,14 +117,14 @@ def test_the_pictures_are_files_too(folder):
 
 
 def test_equal_fits_make_equal_reports(folder, tmp_path):
-    """They contain no clock time, nor do the pictures."""
+    """Reports of equal fits are equal: neither text nor pictures contain a clock time."""
     fit = made_fit()
     write_report(fit, tmp_path / "r", calibrated(fit), command=COMMAND, findings=WEAK)
     assert (tmp_path / "r" / "report.html").read_bytes() == (folder / "report.html").read_bytes()
 
 
 def test_a_fit_of_almost_nothing_has_a_report(tmp_path):
-    """There is no curve, no correlation and no finite interval."""
+    """A fit without a curve, a correlation or a finite interval has a report."""
     fit = made_fit()
     fit = dataclasses.replace(
         fit,

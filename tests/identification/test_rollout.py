@@ -165,7 +165,7 @@ def test_a_batch_equals_its_parts():
 
 
 def test_the_passes_of_a_large_batch_change_nothing(monkeypatch):
-    """Candidates that exceed the memory together are simulated in several passes."""
+    """Candidates that exceed the memory together are simulated in several passes, with the same result."""
     vehicle = load_vehicle("finsrov")
     rollouts = Rollouts(vehicle, [segment(vehicle, steps_of(vehicle, 20))])
     mass = np.linspace(10.0, 14.0, 7)[:, None]
@@ -219,7 +219,7 @@ def test_a_pull_keeps_its_direction_while_the_vehicle_turns():
 
 
 def test_pulls_say_nothing_of_an_unknown_thrust():
-    """Their deviation is relative to the thrust at the file's voltage, so they have the scale of all forces."""
+    """The deviation of pulls is relative to the thrust at the file's voltage, so they scale with all forces."""
     vehicle = load_vehicle("bluerov2_heavy")
     times = np.linspace(0.1, 1.9, 10)
     measured = {name: (times, np.zeros(10)) for name in ("u", "v")}
@@ -241,7 +241,7 @@ def test_pulls_say_nothing_of_an_unknown_thrust():
 
 
 def test_a_submerged_vehicle_does_not_surface_while_it_drifts():
-    """It is simulated far below and reported at its start, so that buoyancy stays complete however high it rises."""
+    """The vehicle is simulated far below and reported at its start, so that buoyancy stays complete as it rises."""
     vehicle = load_vehicle("finsrov").replace({"body.displaced_volume": 0.0121})
     response = Rollouts(
         vehicle, [segment(vehicle, np.zeros((500, 8)), start={"position": np.array([0.0, 0.0, -0.5])})]
@@ -263,7 +263,7 @@ def test_a_candidate_that_diverges_is_told_and_harms_no_other():
 
 
 def test_segments_of_different_steps_are_refused():
-    """One batch has one clock."""
+    """Segments with different time steps are refused, since a batch has one clock."""
     vehicle = load_vehicle("finsrov")
     pair = [segment(vehicle, np.zeros((10, 8))), replace(segment(vehicle, np.zeros((10, 8))), step=0.05)]
     with pytest.raises(CalibrationError, match="one step"):

@@ -89,7 +89,7 @@ noise, all errors were smaller."""
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_numbers_come_back(name):
-    """They are recovered from coefficients off by factors of two, for every kind of input and sensor."""
+    """Parameters are recovered from coefficients off by factors of two, for every kind of input and sensor."""
     vehicle, axes, every, options, within = CASES[name]
     vehicle = load_vehicle(vehicle)
     some = simulate_programme(programmes(axes, vehicle)[::every], vehicle, seed=3, **options)

@@ -124,7 +124,7 @@ def test_a_residual_of_five_standard_deviations_weighs_half():
 
 @pytest.mark.parametrize("cut", [2.5, np.inf])
 def test_slopes_and_curvatures_are_those_of_the_loss(cut):
-    """They equal differences of half Huber's loss of r / std, away from its kink."""
+    """Slopes and curvatures equal differences of half Huber's loss of r / std, away from its kink."""
     std, r, h = np.full(6, 0.2), 0.2 * np.array([-30.0, -2.6, -2.4, 0.0, 1.0, 9.0]), 1e-4
 
     def half_loss(r):
@@ -205,7 +205,7 @@ def test_ctrl_c_keeps_the_best_so_far():
 
 @given(seed=st.integers(0, 10_000))
 def test_a_step_in_a_box_satisfies_the_conditions_of_karush_kuhn_and_tucker(seed):
-    """Inside the box, it is stationary in free directions and pushed against active bounds."""
+    """Inside the box, the step is stationary in free directions and pushed against active bounds."""
     rng = np.random.default_rng(seed)
     n = rng.integers(1, 6)
     root = rng.normal(size=(n, n))

@@ -57,7 +57,7 @@ def test_accelerometer_reads_the_acceleration_of_its_place_and_gravity():
 
 @pytest.mark.slow
 def test_equal_seeds_give_equal_trials():
-    """They are bit-identical when run again; other seeds give other motion and noise."""
+    """Trials of equal seeds are bit-identical; other seeds give other motion and noise."""
     digest = [t.sha256 for t in simulate_programme(SURGE, FINSROV, seed=4)]
     assert digest == [t.sha256 for t in simulate_programme(SURGE, FINSROV, seed=4)]
     assert not set(digest) & {t.sha256 for t in simulate_programme(SURGE, FINSROV, seed=5)}

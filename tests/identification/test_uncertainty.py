@@ -88,7 +88,7 @@ def test_local_covariance_is_too_narrow_when_trials_differ_and_trials_are_not():
 
 
 def test_the_sandwich_agrees_with_trials_drawn_anew():
-    """Two estimates of the same disagreement: the formula, and 2000 draws of 60 trials with replacement."""
+    """The formula agrees with 2000 draws of 60 trials with replacement."""
     _, evidence = fitted(np.random.default_rng(1), 60, shared=0.5)
     times = np.random.default_rng(3).multinomial(60, np.full(60, 1.0 / 60), size=2000).astype(float)
     normal = np.einsum("rg,gij->rij", times, evidence.normal)
@@ -98,7 +98,7 @@ def test_the_sandwich_agrees_with_trials_drawn_anew():
 
 @pytest.mark.parametrize("std", [0.01, 0.1, 1.0])
 def test_intervals_with_a_prior_hold_truths_drawn_from_it(std):
-    """For estimates drawn towards a prior's mean, 95 % intervals cover, and follow the narrower of the two sources."""
+    """For estimates pulled towards a prior's mean, 95 % intervals contain the truth and follow the narrower source."""
     rng, hits, width = np.random.default_rng(4), [], []
     for _ in range(300):
         theta, evidence = fitted(rng, 8)
@@ -203,14 +203,14 @@ def test_infinite_variance_is_said():
 
 
 def test_numbers_that_overflow_are_refused():
-    """They occur with inputs of millions of revolutions a minute."""
+    """Overflowing numbers, as from inputs of millions of revolutions a minute, are refused."""
     evidence = Evidence(names=("c",), normal=np.full((2, 1, 1), np.nan), score=np.zeros((2, 1)))
     with pytest.raises(CalibrationError, match="numbers that overflow: check the units"):
         trial_covariance(evidence)
 
 
 def test_a_parameter_that_is_hardly_known_overflows_nothing():
-    """The square of its variance overflows a float; the degrees of freedom are those of the others all the same."""
+    """The square of a hardly known parameter's variance overflows, but the degrees of freedom of the others stay."""
     noise = np.random.default_rng(0).standard_normal((5, 2))
     for tiny in (1e-9, 1e-200):
         scale = np.array([1.0, tiny])

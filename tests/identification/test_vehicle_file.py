@@ -138,7 +138,7 @@ def test_the_file_is_for_people(tmp_path):
 
 
 def test_numbers_of_one_source_share_it_and_keep_their_notes(tmp_path):
-    """Each has its own interval; the source appears once, at the section."""
+    """Each number has its own interval; the common source appears once, at the section."""
     vehicle = load_vehicle("finsrov")
     for i, key in enumerate(("mass", "displaced_volume", "surface_half_height")):
         vehicle = vehicle.replace(

@@ -44,7 +44,8 @@ def environment(worlds=3, seed=7):
 
 
 def test_episodes_are_what_the_environment_gave():
-    """Of seven episodes, three are of the first world, two of each other; observations chain, rewards are its own."""
+    """Of seven episodes, three are of the first world, two of each other; observations chain, rewards are the
+    world's."""
     found = record_episodes(environment(), Constant(), 7)
     assert len(found) == 7 and all(
         e.observation.shape == (11, 16) and e.action.shape == (10, 6) for e in found
@@ -73,7 +74,7 @@ def test_what_is_disturbed_is_done_and_not_written():
 
 
 def test_an_episode_of_a_world_that_breaks_is_no_demonstration(monkeypatch, tmp_path):
-    """Its world contributes the complete episode that begins next."""
+    """A broken world contributes the complete episode that begins next."""
     monkeypatch.chdir(tmp_path)  # the folder of its last states
     env, step = environment(), Environment.step
 
@@ -91,7 +92,7 @@ def test_an_episode_of_a_world_that_breaks_is_no_demonstration(monkeypatch, tmp_
 
 
 def test_worlds_that_always_break_are_refused(monkeypatch, tmp_path):
-    """The alternative would be to wait for a good episode forever."""
+    """Worlds that always break are refused, instead of waiting for a good episode forever."""
     monkeypatch.chdir(tmp_path)
     env, step = environment(), Environment.step
 

@@ -88,7 +88,7 @@ def test_onnxruntime_computes_what_torch_does(tmp_path, network):
 
 
 def test_a_plain_perceptron_is_exported_in_half_a_second(tmp_path):
-    """The whole training may take 40 s; torch's own exporter would take several of them."""
+    """The export is fast, as a training may take 40 s in all; torch's own exporter would take several of them."""
     network = perceptron(nn.Tanh, width=256)
     export_policy(network, tmp_path / "first", description())
     start = time.process_time()
@@ -126,7 +126,7 @@ def test_a_network_of_other_sizes_is_refused_and_leaves_nothing(tmp_path):
 
 
 def test_a_trained_network_with_large_gains_is_exported(tmp_path):
-    """Float32 alone rounds such a network's actions by more than 1e-6, which is not an error of the export."""
+    """A network with large gains is exported, although float32 alone rounds its actions by more than 1e-6."""
     network = perceptron(nn.ELU, width=256)
     with torch.no_grad():
         for parameter in network.parameters():
@@ -207,7 +207,7 @@ def learned_elsewhere(library, worlds):
 
 @pytest.mark.parametrize("library", ["torch", "PPO", "SAC", "rsl-rl"])
 def test_what_is_learned_elsewhere_runs_everywhere(library, tmp_path):
-    """It is written with its environment's task, vehicle, limits and scale; the robot's agent acts like the model."""
+    """A policy has its environment's task, vehicle, limits and scale; the robot's agent acts like the model."""
     worlds = finssim.make("t1", worlds=2, vehicle="bluerov2_heavy", wrench_scale=0.5, seed=3)
     model, act = learned_elsewhere(library, worlds)
     folder = save_policy(model, worlds, tmp_path / "policy", steps=12)

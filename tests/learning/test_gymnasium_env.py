@@ -34,7 +34,7 @@ def test_every_task_of_one_agent_is_registered():
 @UNBOUNDED
 @pytest.mark.parametrize("task", ["t1", "pursuit"])
 def test_a_task_of_one_agent_can_be_made_by_name(task):
-    """`gymnasium.make` and `make_vec` find it by its class, and pass options on."""
+    """`gymnasium.make` and `make_vec` find a task by the name of its class, and pass options on."""
     name, size = f"finssim/{TASKS[task].__name__}-v0", TASKS[task]().observation_size
     # Agents of a team task are commanded by wrench.
     action, wide = ("wrench6", 6) if TASKS[task]().others else ("thruster8", 8)
@@ -137,7 +137,7 @@ def test_the_next_episode_may_begin_in_the_next_step():
 
 
 def test_gymnasiums_statistics_are_the_tasks():
-    """Its wrapper, which supports only NEXT_STEP, counts returns and lengths as the task does."""
+    """Gymnasium's wrapper, which supports only NEXT_STEP, counts returns and lengths as the task does."""
     batch = RecordEpisodeStatistics(VectorEnv(2, SHORT, autoreset_mode=AutoresetMode.NEXT_STEP))
     batch.reset(seed=2)
     for _ in range(11):

@@ -56,7 +56,7 @@ def test_a_stacks_gradient_is_torchs(device):
 
 @LIBRARIES
 def test_a_grus_gradient_is_torchs_through_time(device):
-    """In some rows, episodes start within the time segment."""
+    """Gradients through time agree, with episodes that start within the time segment in some rows."""
     arrays, rng = Arrays(1, device), np.random.default_rng(3)
     n, k, T, rows = 4, 5, 6, 3
     gru = Gru(arrays, n, k)
@@ -88,7 +88,7 @@ def test_a_grus_gradient_is_torchs_through_time(device):
 
 @LIBRARIES
 def test_adam_is_torchs(device):
-    """The steps include gradients longer and shorter than the limit."""
+    """Steps equal those of torch, for gradients longer and shorter than the limit."""
     arrays, rng = Arrays(1, device), np.random.default_rng(4)
     row = FreeRow(9)
     parameters = NetworkParameters(arrays, row)
@@ -139,7 +139,7 @@ def network(rng, history, last_action, cell, scaled, errors=()):
     ],
 )
 def test_onnxruntime_computes_what_the_arrays_do(history, last_action, errors, cell, scaled):
-    """They agree step by step, each with its own memory of the previous step; so does torch on the same arrays."""
+    """Outputs agree step by step, each with its own memory of the previous step; so does torch on the same arrays."""
     import onnxruntime
 
     rng = np.random.default_rng(5)
@@ -158,7 +158,8 @@ def test_onnxruntime_computes_what_the_arrays_do(history, last_action, errors, c
 
 
 def test_integrals_grow_near_the_goal_up_to_a_limit():
-    """They grow by rate · e · exp(-(e / reach)²) a step and are added to the error; a distant goal adds nothing."""
+    """Integrals grow by rate · e · exp(-(e / reach)²) a step and are added to the error; a distant goal adds
+    nothing."""
     observation = np.array([[0.02, 5.0, -0.04], [1.0, 5.0, 0.0]])
     seen, z = with_integrals(np, observation, np.zeros((2, 2)), (0, 2))
     expected = INTEGRAL_RATE * np.array([[0.02 * np.exp(-0.25), -0.04 * np.exp(-1.0)], [0.0, 0.0]])
@@ -171,7 +172,7 @@ def test_integrals_grow_near_the_goal_up_to_a_limit():
 
 
 def test_a_history_is_of_the_last_observations_newest_first():
-    """It is scaled and padded with zeros at the start of an episode; the last action is the limited one."""
+    """The history is scaled and padded with zeros at the start of an episode; the last action is the limited one."""
     weight = np.zeros((4, 1), np.float32)
     weight[0] = 10.0
     ours = Network(
@@ -193,7 +194,7 @@ def test_a_history_is_of_the_last_observations_newest_first():
 
 
 def test_torchs_layers_are_the_same_network():
-    """This covers the activations that both torch and ONNX have."""
+    """Torch's layers agree for the activations that both torch and ONNX have."""
     torch.manual_seed(6)
     module = nn.Sequential(
         nn.Linear(5, 6), nn.ELU(0.7), nn.Linear(6, 6), nn.ReLU(), nn.Linear(6, 2, bias=False)
@@ -204,7 +205,7 @@ def test_torchs_layers_are_the_same_network():
 
 
 def test_equal_seeds_are_equal_numbers():
-    """Noise, orders and initial weights are equal; a saved state continues where it was saved."""
+    """Noise, orders and initial weights of equal seeds are equal; a saved state continues where it was saved."""
     draws = []
     for seed in (1, 1, 2):
         arrays = Arrays(seed)
@@ -221,7 +222,7 @@ def test_equal_seeds_are_equal_numbers():
 
 
 def test_first_weights_are_orthogonal():
-    """They are scaled by the gain, whichever side is longer."""
+    """Initial weights are orthogonal and scaled by the gain, whichever side is longer."""
     for rows, columns in ((4, 7), (7, 4)):
         w = Arrays(1).orthogonal(rows, columns, 2.0)
         square = w @ w.T if rows < columns else w.T @ w

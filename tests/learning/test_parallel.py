@@ -26,7 +26,7 @@ def test_gradients_are_averaged(tmp_path):
 
 @pytest.mark.slow
 def test_a_policy_is_trained_by_two_processes(tmp_path):
-    """They run on a CPU with gloo; curves count the steps of both."""
+    """Two processes run on a CPU with gloo; curves count the steps of both."""
     settings = TrainingSettings(worlds=32, steps=3 * 4096, processes=2, seed=3)
     policy = Policy.load(train("t1", settings, out=tmp_path / "p"))
     assert policy.description.training["complete"] and policy.description.training["processes"] == 2

@@ -49,7 +49,7 @@ def policy(tmp_path_factory):
 
 
 def test_it_acts_as_torch_steps_its_gru(policy):
-    """They agree step by step, each row with its own memory, and through the start of an episode in some rows."""
+    """Policy and torch agree step by step, each row with its own memory, and through episode starts in some rows."""
     gru, layers = parts()
     run = Policy.load(policy)
     rng, state, memory = np.random.default_rng(2), torch.zeros(1, 5, 16), run.reset(5)
@@ -99,7 +99,7 @@ def test_a_memory_that_is_not_the_policys_is_refused(policy, tmp_path):
 
 
 def test_a_module_that_remembers_is_not_exported(tmp_path):
-    """Torch's exporter does not support memories."""
+    """A module with memory is refused, since torch's exporter does not support memories."""
     with pytest.raises(ExportError, match="a torch module with memory cannot be written"):
         written(Counting(), tmp_path / "p", StationKeeping(), 6)
     size = StationKeeping().schema.size
@@ -108,7 +108,7 @@ def test_a_module_that_remembers_is_not_exported(tmp_path):
 
 
 def test_a_pilot_remembers_until_it_is_reset(policy):
-    """Its thrusts are those of the policy's own steps; after `reset` the first ones come again."""
+    """The pilot's thrusts are those of the policy's own steps; after `reset` the first ones come again."""
     pilot, run = make_pilot(policy, FINSROV), Policy.load(policy)
     mode, seen = action_mode("wrench6", FINSROV), Observer("t1", FINSROV).observe(READING, STATION, 0.0)
     memory, given = run.reset(1), []
@@ -122,7 +122,7 @@ def test_a_pilot_remembers_until_it_is_reset(policy):
 
 
 def test_an_agent_remembers_and_begins_anew_where_an_episode_does(policy):
-    """Its actions are those of the policy's own steps, row by row, in evaluation and imitation."""
+    """The agent's actions are those of the policy's own steps, row by row, in evaluation and imitation."""
     environment, task = finssim.make("t1", worlds=3, seed=4), StationKeeping()
     agent, run = agent_for(policy, FINSROV, task), Policy.load(policy)
     expert = expert_for(policy, FINSROV, task, "wrench6")
@@ -156,7 +156,7 @@ class Counting(nn.Module):
 
 
 def test_a_held_evaluation_begins_without_memory():
-    """It carries the memory from step to step."""
+    """A held evaluation starts without memory and carries it from step to step."""
     held = HeldEvaluation(finssim.make(replace(StationKeeping(), time_limit=1.0), worlds=2, seed=5))
     network = Counting()
     for _ in range(2):

@@ -72,7 +72,7 @@ def test_a_seed_starts_over():
 
 
 def test_a_critic_may_know_what_was_drawn():
-    """Its group has the privileged numbers after the observation; the policy's does not."""
+    """The critic's group has the privileged numbers after the observation; the policy's does not."""
     env = RslRlVecEnv(SHORT, worlds=3, randomize="hold_for_position", privileged=True)
     groups, drawn = env.get_observations(), env.environment.arrays.privileged.numpy()
     assert groups["policy"].shape == (3, 16) and drawn.shape[1] == len(env.environment.privileged_names) > 0

@@ -55,7 +55,7 @@ def trained(tmp_path_factory):
 
 
 def test_the_policy_loads_for_what_it_was_trained_with(trained):
-    """Vehicle, task, action mode and rate are those of the training, and it computes actions."""
+    """Vehicle, task, action mode and rate are those of the training, and the policy computes actions."""
     vehicle, task = load_vehicle("finsrov"), StationKeeping()
     schema = task.schema.model_dump(mode="json")
     policy = Policy.load(
@@ -69,7 +69,8 @@ def test_the_policy_loads_for_what_it_was_trained_with(trained):
 
 
 def test_the_description_is_enough_to_repeat_the_training(trained):
-    """It contains the seed, settings of learner and task, the vehicle's hash, completed steps, and the revision."""
+    """The file contains the seed, settings of learner and task, the vehicle's hash, completed steps, and the
+    revision."""
     told = yaml.safe_load((trained / "policy.yaml").read_text(encoding="utf-8"))
     training = told["training"]
     assert told["seed"] == 5 and told["vehicle"]["sha256"] == load_vehicle("finsrov").sha256
@@ -93,7 +94,7 @@ def test_curves_and_log_are_written(trained):
 
 @pytest.mark.slow
 def test_equal_seeds_are_equal_policies(trained, tmp_path):
-    """They are bit-identical; another seed gives another policy, which may be trained into the same directory."""
+    """Policies of equal seeds are bit-identical; another seed gives another, in the same directory if wanted."""
     assert network(train("t1", TrainingSettings(seed=6, **TINY), out=tmp_path / "p")) != network(trained)
     assert network(train("t1", TrainingSettings(seed=5, **TINY), out=tmp_path / "p")) == network(trained)
 
@@ -143,7 +144,7 @@ def test_an_interrupted_training_writes_the_policy_so_far(tmp_path, monkeypatch)
 
 @pytest.mark.slow
 def test_an_interrupted_training_leaves_an_earlier_policy_alone(trained, tmp_path, monkeypatch, capsys):
-    """The policy so far is written beside it, which is reported; a finished training replaces it as usual."""
+    """The policy so far is written beside the earlier one, which is reported; a finished training replaces it."""
     out = tmp_path / "p"
     shutil.copytree(trained, out)
     interrupt_after(2, monkeypatch)
@@ -156,7 +157,7 @@ def test_an_interrupted_training_leaves_an_earlier_policy_alone(trained, tmp_pat
 
 
 def test_a_training_interrupted_before_it_learned_writes_no_policy(trained, tmp_path, monkeypatch, capsys):
-    """It writes neither a new one nor over an earlier one: the network would be the random initial one."""
+    """No policy is written, nor an earlier one replaced: the network would be the random initial one."""
     interrupt_after(0, monkeypatch)
     shutil.copytree(trained, tmp_path / "earlier")
     for name in ("new", "earlier"):
@@ -173,7 +174,7 @@ SMALL = {"worlds": 16, "steps": 4096, "seed": 5, "settings": {"rollout": 32, "ba
 
 @pytest.mark.slow
 def test_the_last_two_checkpoints_are_kept_and_are_policies(tmp_path):
-    """Each is beside the policy, named by its steps, and loads.
+    """Each checkpoint is beside the policy, named by its steps, and loads.
 
     Those of an earlier and longer training are removed: they would count as newer, and this one's would be removed.
     """
@@ -255,7 +256,7 @@ def test_only_the_same_training_is_resumed(tmp_path, capsys):
 
 @pytest.mark.parametrize("learner", ["ppo", pytest.param("torchrl-ppo", marks=pytest.mark.slow)])
 def test_a_learner_whose_numbers_run_away_is_stopped(tmp_path, learner):
-    """It gives one sentence and no policy."""
+    """A diverging learner is stopped with one sentence, and no policy is written."""
     options = {**SMALL, "settings": {**SMALL["settings"], "learning_rate": 1e30}}
     with pytest.raises((LearningError, EnvironmentSetupError), match="diverged"):
         train("t1", TrainingSettings(learner=learner, **options), out=tmp_path / "p")
@@ -298,7 +299,7 @@ def test_a_learner_whose_numbers_run_away_is_stopped(tmp_path, learner):
     ],
 )
 def test_what_cannot_be_trained_is_refused_at_once(tmp_path, options, error, sentence):
-    """One sentence refuses it, and no files are left."""
+    """An impossible training is refused in one sentence, and no files are left."""
     task = options.pop("task", "t1")
     with pytest.raises(error, match=sentence):
         train(task, TrainingSettings(**{**TINY, **options}), out=tmp_path / "p")
@@ -314,7 +315,8 @@ def test_somebodys_files_are_not_replaced(tmp_path):
 
 @pytest.mark.slow
 def test_a_policy_trained_from_nothing_holds_the_published_setpoints(tmp_path):
-    """All eight are held in the nominal plant, within 2 cm and 1.5° once settled: seed 1, default settings."""
+    """All eight setpoints are held in the nominal plant, within 2 cm and 1.5° once settled: seed 1, default
+    settings."""
     result = evaluate_controller(
         train("t1", TrainingSettings(seed=1), out=tmp_path / "p"), load_plant("nominal")
     ).result
@@ -323,7 +325,7 @@ def test_a_policy_trained_from_nothing_holds_the_published_setpoints(tmp_path):
 
 
 def test_a_training_ends_where_the_held_episodes_succeed(tmp_path):
-    """Two successes in a row end it before its steps are done; the curves end there, and the policy is complete."""
+    """Two successes in a row end the training early; the curves end there, and the policy is complete."""
     settings = {"learning_rate": 1e-2, "discount": 0.5, "rollout": 16, "batch": 64, "hidden": [16, 16]}
     folder = train(
         Guess(),
@@ -348,7 +350,7 @@ def test_a_training_ends_where_the_held_episodes_succeed(tmp_path):
 
 
 def test_the_network_that_did_best_is_left(tmp_path, monkeypatch):
-    """Among the held evaluations it has the most successes; ties are decided by the return, then by the later one."""
+    """The network with the most successes in held evaluations is kept; ties go to the return, then to the later one."""
     scores = iter(
         [(0.1, 5.0), (0.9, 1.0), (0.9, 2.0), (0.9, 2.0), (0.5, 9.0), (0.9, 1.9), (0.0, 0.0), (0.8, 8.0)]
     )
@@ -368,7 +370,7 @@ def test_the_network_that_did_best_is_left(tmp_path, monkeypatch):
 
 
 def test_a_policy_that_begins_from_a_pid_holds_sooner(tmp_path):
-    """After 50,000 steps, an eighth of the default, it holds all setpoints; trained from scratch it holds none."""
+    """After 50,000 steps, an eighth of the default, the policy holds all setpoints; trained from scratch, none."""
     folder = train("t1", TrainingSettings(seed=1, steps=50_000, init="pid"), out=tmp_path / "p")
     result = evaluate_controller(folder, load_plant("nominal")).result
     assert (result["success"], result["trials"]) == (8, 8) and result["e_p_m"] < 0.005
@@ -379,7 +381,7 @@ def test_a_policy_that_begins_from_a_pid_holds_sooner(tmp_path):
 
 
 def test_team_pursuit_begins_from_its_baseline_where_that_can_act(tmp_path):
-    """This is in the task's own action mode, unless another teacher or none is requested."""
+    """Training starts from the baseline in the task's own action mode, unless another teacher or none is requested."""
     tiny = {"worlds": 8, "steps": 4096, "settings": {"hidden": [16]}}
     for options, teacher in (({}, "formation"), ({"action": "wrench6"}, ""), ({"init": "none"}, "")):
         folder = train("team-pursuit", TrainingSettings(**tiny, **options), out=tmp_path / "p")

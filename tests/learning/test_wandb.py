@@ -28,7 +28,7 @@ def test_curves_go_to_one_run_which_a_resumed_training_goes_on_with(tmp_path, mo
 
 @pytest.mark.slow
 def test_nobody_logged_in_is_one_sentence(tmp_path):
-    """The test uses a separate process, as Weights & Biases reads its environment only once."""
+    """Without a login, a separate process (Weights & Biases reads its environment only once) prints one sentence."""
     words = [
         "train",
         "t1",

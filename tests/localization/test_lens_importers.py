@@ -269,7 +269,7 @@ READ = {
 
 @pytest.mark.parametrize("name", READ)
 def test_a_foreign_lens_gives_the_pixels_of_its_own_equations(name, tmp_path):
-    """They agree to a millionth of a pixel, which reveals the order of coefficients and the pixel origin."""
+    """Pixels agree to a millionth, which reveals the order of coefficients and the pixel origin."""
     file, write, pixels = READ[name]
     write(tmp_path / file)
     lens = load_camera(tmp_path / file).lens

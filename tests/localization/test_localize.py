@@ -150,7 +150,7 @@ def test_a_wrong_imu_file_is_refused(files, text, words):
 
 
 def test_corners_in_another_order_give_the_same_poses(files):
-    """The order is that of AprilTag's own library: bottom left first, counter-clockwise; the vehicle has two tags."""
+    """Corners in the order of AprilTag's own library (bottom left first, counter-clockwise) give the same poses."""
     options = {"depth": files / "depth.csv", "imu": files / "imu.csv"}
     _, expected = located(files, **options)
     frames = [

@@ -68,7 +68,7 @@ def test_the_world_lies_on_the_water_where_nothing_else_is_said():
 
 
 def test_the_hash_is_of_the_geometry_alone():
-    """A record does not change it, a millimetre of water does."""
+    """A record does not change the hash, a millimetre of water does."""
     assert pool(record={"a": 1}).sha256 == pool().sha256
     assert pool(interface=Interface.water(0.961)).sha256 != pool().sha256
 
@@ -85,7 +85,7 @@ def test_level_water_may_be_written_in_three_ways(interface, tmp_path):
 
 
 def test_the_lens_may_stand_in_a_file_of_its_own(tmp_path):
-    """`lens: camera.yaml` is read beside the pool file."""
+    """A lens given as `lens: camera.yaml` is read beside the pool file."""
     (tmp_path / "camera.yaml").write_text("lens: {width: 1280, height: 720, fx: 541, cx: 682, cy: 349}\n")
     path = tmp_path / "pool.yaml"
     path.write_text(
@@ -99,7 +99,7 @@ def test_the_lens_may_stand_in_a_file_of_its_own(tmp_path):
     [({}, 0.5), ({"residual": {"pixel_sigma": 0.83}}, 0.83), ({"residual": {"pixel_sigma": 0.001}}, 0.05)],
 )
 def test_the_noise_of_a_corner_is_what_the_calibration_found(record, expected):
-    """It is that of the residuals, but never below a detector's limit; half a pixel if it is unknown."""
+    """The noise is that of the residuals, but never below a detector's limit; half a pixel if it is unknown."""
     assert pool(record=record).pixel_std == expected
 
 

@@ -115,7 +115,7 @@ def test_height_plane_and_column(tmp_path, pool, capsys):
 
 
 def test_a_plane_above_the_water_is_not_met(tmp_path, pool, capsys):
-    """There is no point, and the reason is given."""
+    """A plane above the water gives no point, and the reason is printed."""
     run_backproject(given(tmp_path, "u,v\n600,300\n"), pool=pool, z=1.5)
     shown = capsys.readouterr()
     (row,) = table(shown.out)

@@ -67,7 +67,7 @@ def test_thickness_adds_up():
     ],
 )
 def test_impossible_planes_and_poses_are_refused(make, words):
-    """One sentence states the expected values."""
+    """An impossible plane or pose is refused in one sentence that states the expected values."""
     with pytest.raises(OpticsError) as refused:
         make()
     assert words in str(refused.value)

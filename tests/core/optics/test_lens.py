@@ -195,7 +195,7 @@ def test_the_image_reaches_half_a_pixel_past_its_outer_centres():
     ],
 )
 def test_an_impossible_lens_is_refused(change, words):
-    """One sentence states the expected values."""
+    """An impossible lens is refused in one sentence that states the expected values."""
     with pytest.raises(OpticsError) as refused:
         Lens(**{**SIZE, **change})
     assert words in str(refused.value)

@@ -56,7 +56,7 @@ def linear(folder, rows=4000):
 
 @pytest.mark.slow
 def test_cloning_finds_the_function_that_was_shown(tmp_path):
-    """The error is a tenth of its spread after forty passes, and decreases with more steps."""
+    """The error is a tenth of the action's spread after forty passes, and decreases with more steps."""
     place, observation, action = linear(tmp_path / "set")
     learner = made("bc", demonstrations=place, steps=160_000, rollout=16_000, learning_rate=3e-3)
     losses = []

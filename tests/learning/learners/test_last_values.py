@@ -56,7 +56,7 @@ def returns(name, learner, value):
     ],
 )
 def test_time_ends_no_value(name, task):
-    """Four worlds run for twelve steps, with an end by time at least twice in each."""
+    """All returns equal V in four worlds over twelve steps, with an end by time at least twice in each."""
     learner = made(name, task())
     value = 1.0 / (1.0 - DISCOUNT)
     np.testing.assert_allclose(returns(name, learner, value), value, rtol=1e-5)

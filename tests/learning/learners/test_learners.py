@@ -122,7 +122,7 @@ def test_it_learns_and_goes_on_bitwise(tmp_path, name, task):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", REINFORCED)
 def test_equal_seeds_are_equal_learners(name):
-    """Another seed gives another learner."""
+    """Learners of equal seeds are equal; another seed gives another one."""
     task = Guess() if name in ONE else GuessTogether()
     ends = []
     for seed in (1, 1, 2):
@@ -157,7 +157,7 @@ def test_unknown_names_are_refused():
     ],
 )
 def test_settings_that_nothing_can_be_learnt_with_are_refused(name, value, sentence):
-    """Otherwise they would cause a division by zero, or fail after the first update; optional values may be 0."""
+    """Settings that would divide by zero, or fail after the first update, are refused; optional ones may be 0."""
     kind = learner_named("sb3-ppo")
     with pytest.raises(LearningError, match=sentence):
         kind.settings(Guess(), changes={name: value})

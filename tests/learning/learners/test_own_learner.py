@@ -73,7 +73,7 @@ def file(tmp_path):
 
 
 def test_a_learner_of_ones_own_trains_resumes_and_says_what_it_is(file, tmp_path):
-    """Its settings, name and steps are recorded in the policy, which runs without it."""
+    """The learner's settings, name and steps are recorded in the policy, which runs without the learner."""
     folder = train(
         "t1", TrainingSettings(learner=f"{file}:Climb", seed=3, settings={"spread": 0.2}), out=tmp_path / "p"
     )

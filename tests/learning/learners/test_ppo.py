@@ -79,7 +79,7 @@ def test_torch_learns_what_numpy_learns(changes):
 
 @pytest.mark.parametrize("changes", VARIANTS)
 def test_nothing_goes_through_the_host_between_two_rows(monkeypatch, changes):
-    """As on a GPU, this is torch without the environment's own check for frozen worlds, which is rare there."""
+    """On the CPU as on a GPU, torch reads nothing back; the environment's rare check for frozen worlds is excluded."""
     learner = made(StationKeeping(), Torch(3), **changes)
     held = HeldEvaluation(finssim.make(StationKeeping(time_limit=1.0), worlds=4, seed=1))
     touched = []

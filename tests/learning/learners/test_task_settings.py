@@ -34,7 +34,7 @@ def test_the_tasks_own_lines_outrank_the_others(monkeypatch):
     ],
 )  # importing torchrl starts a process
 def test_a_training_begins_with_its_tasks_settings(name, randomized):
-    """Options of the command take precedence over them."""
+    """A training has the settings of its task, over which options of the command take precedence."""
     kind = learner_named(name)
     for task in numeric_tasks():
         settings = kind.settings(task_named(task), randomized=randomized)
@@ -52,7 +52,7 @@ def test_every_line_is_of_something_that_exists():
 
 
 def test_a_task_of_ones_own_has_the_defaults():
-    """Its name is in no table."""
+    """A user's task is in no table and has the default settings."""
     kind = learner_named("sb3-ppo")
     module = sys.modules[type(kind.settings(Guess())).__module__]
     assert kind.settings(Guess(), worlds=256) == module.OnPolicySettings()
@@ -73,7 +73,7 @@ def test_a_gpu_takes_as_many_gradient_steps_of_more_samples():
 
 
 def test_a_training_that_imitates_first_keeps_its_size_on_a_gpu():
-    """Its teacher acts on the host, in every world."""
+    """A training with imitation is not enlarged, since its teacher acts on the host, in every world."""
     kind, task = learner_named("ppo"), task_named("t1")
     plain = _values(TrainingSettings(device="cuda"), kind, "ppo", task)
     taught = _values(TrainingSettings(device="cuda", init="pid"), kind, "ppo", task)

@@ -30,7 +30,7 @@ def same(a, b):
 
 
 def test_what_is_written_reads_back_bit_for_bit(tmp_path):
-    """This covers times, names, corners, unknown margins, pictures without tags and pictures without a time."""
+    """Times, names, corners, unknown margins, pictures without tags and pictures without a time read back exactly."""
     frames = [
         Frame(0.1, "a.png", (Detection(15, RING, 71.3, 1, "tag25h9"), Detection(16, RING + 1.0 / 3.0))),
         Frame(0.2, "b.png", ()),
@@ -110,7 +110,7 @@ def test_a_file_that_is_no_detections_file_is_refused(tmp_path, text, sentence):
 
 
 def test_a_file_that_is_not_there_is_refused(tmp_path):
-    """A directory is refused too."""
+    """A missing file is refused, and so is a directory."""
     for path in (tmp_path / "none.csv", tmp_path):
         with pytest.raises(LocalizationError, match="cannot be read"):
             read_detections(path)

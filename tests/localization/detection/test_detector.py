@@ -81,7 +81,8 @@ def test_corners_lie_where_they_were_drawn(family, refine):
 @pytest.mark.parametrize("family", USUAL)
 @pytest.mark.parametrize("blur", [0.0, 0.5, 1.0])
 def test_the_fit_is_better_than_a_tenth_of_a_pixel_on_small_tags(family, blur):
-    """Conditions are borders of 25 px, noise of 2.5 levels, and a margin narrower than the required cell."""
+    """Errors are below 0.1 px at borders of 25 px, noise of 2.5 levels, and a margin narrower than the
+    required cell."""
     missed, drawn = errors(family, detector(family), edge=25.0, count=12, blur=blur, noise=2.5, margin=0.78)
     assert len(missed) >= 11
     assert np.sqrt(np.mean(missed**2)) < 0.07

@@ -78,7 +78,7 @@ def test_times_may_come_from_a_table(tmp_path):
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
 @pytest.mark.parametrize("share", [0.0, 0.02, 0.5, 0.95])
 def test_a_picture_cut_short_is_named_and_left_out(tmp_path, suffix, share):
-    """This holds even where the decoder would fill the rest with gray; the others are read, and the number is
+    """A cut picture is named and skipped, even where the decoder would fill the rest with gray; the number is
     reported."""
     busy = RNG.integers(0, 255, (48, 64)).astype(np.uint8)
     for number in (1, 2, 3):
@@ -103,7 +103,7 @@ def test_a_whole_jpeg_with_something_behind_it_is_read(tmp_path):
 
 
 def test_a_run_of_which_nothing_can_be_read_is_refused(tmp_path):
-    """The refusal contains the first reason."""
+    """A folder without a readable picture is refused with the first reason."""
     for number in (1, 2):
         (tmp_path / f"{number}.png").write_bytes(b"no picture")
     told = []
@@ -113,7 +113,7 @@ def test_a_run_of_which_nothing_can_be_read_is_refused(tmp_path):
 
 
 def test_what_is_not_there_is_refused_at_once(tmp_path):
-    """The refusal comes before the first picture is requested."""
+    """A missing source is refused before the first picture is requested."""
     (tmp_path / "a.txt").write_text("x")
     for source, sentence in [
         (tmp_path / "none", "no such file or folder"),
@@ -127,7 +127,7 @@ def test_what_is_not_there_is_refused_at_once(tmp_path):
 
 
 def test_two_pictures_of_one_name_are_told_apart(tmp_path):
-    """Their names include the folders."""
+    """Pictures with equal names are named with their folders."""
     for folder in ("a", "b"):
         write_picture(scene(50), tmp_path / folder / "1.png")
     names = [name for _, name, _ in listed([tmp_path / "a", tmp_path / "b"])]

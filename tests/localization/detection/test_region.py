@@ -81,7 +81,7 @@ def test_a_missing_tag_is_searched_in_the_whole_picture_every_so_often():
 
 
 def test_a_tag_that_is_hidden_for_a_while_is_found_near_where_it_was():
-    """While it is lost, the region grows and follows its last velocity."""
+    """While a tag is lost, the search region grows and follows the tag's last velocity."""
     corners = ring_at(100, 100)
     widths = [np.diff(np.reshape(region_around(corners, lost), (2, 2)), axis=0).min() for lost in range(5)]
     assert all(a < b for a, b in itertools.pairwise(widths))
@@ -115,7 +115,7 @@ def test_tags_nobody_asked_for_are_left_out():
 
 
 def test_pictures_without_tags_cost_one_whole_search_each():
-    """They give no detections."""
+    """Pictures without tags need one whole search each and give no detections."""
     searches = Searches()
     tracker = RegionTracker(searches, [15])
     assert [tracker.detect(EMPTY, 0.1 * k) for k in range(3)] == [[], [], []]

@@ -123,7 +123,7 @@ def test_errors_are_as_large_as_the_covariance_says(choice):
 
 @pytest.mark.slow
 def test_fixes_bound_what_log_and_compass_alone_let_grow():
-    """An acoustic outlier is refused by the gate."""
+    """Fixes bound the error, which grows with log and compass alone, and an acoustic outlier is refused by the gate."""
     alone, fixed = swim(0)[1], swim(0, **CHOICES["log, compass and acoustics"])
     assert np.trace(fixed[1]) < np.trace(alone)
     assert fixed[2].counts["vision"].get("gate", 0) >= 1
@@ -149,7 +149,7 @@ def test_without_log_and_compass_nothing_is_added():
 
 @pytest.mark.parametrize("std", [0.0, 0.5 * AIDS.velocity_std, 5.0 * AIDS.velocity_std])
 def test_a_velocity_may_be_less_certain_than_the_log(std):
-    """It is never more certain: its own variance is that of its residual, if that is greater."""
+    """A velocity's own deviation is used where it exceeds the log's; a smaller one changes nothing."""
     distances = []
     for own in (0.0, std):
         estimator = Estimator(SETTINGS, SITE)

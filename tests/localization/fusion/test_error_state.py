@@ -94,7 +94,7 @@ def test_propagation_carries_errors_as_its_covariance_says():
     ids=["position", "depth", "yaw"],
 )
 def test_measurement_jacobians_are_derivatives(model, m):
-    """They equal central differences of each measurement over all fifteen errors."""
+    """Jacobians equal central differences of each measurement over all fifteen errors."""
     state = some_state(1)
     numeric = jacobian(lambda d: model(moved(state, d))[0] - model(state)[0], m)
     np.testing.assert_allclose(model(state)[1], numeric, atol=1e-8)
@@ -109,7 +109,7 @@ def aided_state(random):
 
 @pytest.mark.parametrize("model", ["velocity", "heading"])
 def test_jacobians_of_doppler_log_and_compass_are_derivatives(model):
-    """They equal central differences through `correct`, which moves the error into the state."""
+    """Jacobians equal central differences through `correct`, which moves the error into the state."""
     random = np.random.default_rng(3)
     s, omega, lever = aided_state(random), random.standard_normal(3), np.array([0.1, -0.2, 0.3])
 

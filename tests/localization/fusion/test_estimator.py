@@ -392,7 +392,7 @@ def test_the_camera_may_be_late(latency):
 
 
 def test_a_latency_that_is_not_told_is_an_error_of_speed_times_delay():
-    """The same delay is stamped as zero."""
+    """The same delay, stamped as zero, gives an error of speed times delay."""
     samples = [
         replace(s, time=s.time + 0.1) if s.stream == "vision" else s for s in streams(12.0, noise=QUIET)
     ]
@@ -429,7 +429,7 @@ def test_a_tilt_of_the_vehicle_moves_the_depth_port():
 
 
 def test_health_is_plain_json_with_the_published_keys():
-    """It has every key of the status message, and only numbers that JSON can represent."""
+    """The health has every key of the status message, and only numbers that JSON can represent."""
     e = estimator()
     text = json.dumps(e.health(e.estimate()).as_json(), allow_nan=False)
     for s in streams(2.0):
@@ -518,6 +518,6 @@ def test_a_new_sensor_is_one_entry_of_the_table(mode, monkeypatch):
 
 
 def test_an_unknown_mode_is_refused_with_the_names():
-    """The sentence lists the available modes."""
+    """An unknown mode is refused in a sentence that lists the available ones."""
     with pytest.raises(LocalizationError, match="constant-velocity, error-state"):
         Estimator(mode="kalman")

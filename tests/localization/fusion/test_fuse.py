@@ -76,7 +76,7 @@ def read_out(path):
 
 @pytest.mark.parametrize("mode", list(MODELS))
 def test_a_folder_of_tables_becomes_one_table(tmp_path, pool, mode, capsys):
-    """It has 60 rows a second with states, deviations and counts; errors against the truth file are centimetres."""
+    """The table has 60 rows a second with states, deviations and counts; errors against the truth are centimetres."""
     log = write_log(tmp_path / "log", samples())
     run(log, pool=pool, vehicle="finsrov", out=tmp_path / "out.csv", settings=FuseSettings(estimator=mode))
     columns, states = read_out(tmp_path / "out.csv")
@@ -94,7 +94,7 @@ def test_a_folder_of_tables_becomes_one_table(tmp_path, pool, mode, capsys):
 
 
 def test_json_holds_the_summary(tmp_path, pool, capsys):
-    """It is one object, without NaN, with states, refusals by reason, NIS, errors and the health at the end."""
+    """The summary is one object, without NaN, with states, refusals by reason, NIS, errors and the final health."""
     log = write_log(tmp_path / "log", samples(3.0))
     run(log, pool=pool, vehicle="finsrov", out=tmp_path / "out.csv", as_json=True)
     summary = json.loads(capsys.readouterr().out)
@@ -349,7 +349,7 @@ def test_a_log_of_the_camera_alone_gives_place_and_heading(tmp_path, pool):
 
 @pytest.mark.parametrize("std", [0.0, -0.01])
 def test_a_fix_that_is_exact_or_better_is_refused(tmp_path, std):
-    """A deviation of zero or below is invalid."""
+    """A fix with a deviation of zero or below is refused."""
     names = ("t", "x", "y", "yaw", "std_x", "std_y", "std_yaw")
     path = write_table(tmp_path / "log" / "vision.csv", names, [(0, 1, 1, 0, std, 0.1, 0.1)])
     (fix,) = load_log(path.parent, FINSROV).samples
@@ -357,7 +357,7 @@ def test_a_fix_that_is_exact_or_better_is_refused(tmp_path, std):
 
 
 def test_acceleration_without_gravity_is_no_specific_force(tmp_path, pool):
-    """It is ignored, which is reported, and the error-state mode then names the data it needs."""
+    """Such columns are ignored, which is reported, and the error-state mode then names the data it needs."""
     items = [replace(s, force=(0.1, 0.0, 0.2)) if s.stream == "imu" else s for s in samples(0.5)]
     log = load_log(write_log(tmp_path / "log", items), FINSROV)
     assert any("hold no gravity" in note for note in log.notes)
@@ -366,7 +366,7 @@ def test_acceleration_without_gravity_is_no_specific_force(tmp_path, pool):
 
 
 def test_a_pool_with_z_down_is_refused(tmp_path, pool):
-    """Heading and depth are fused about a z that points up."""
+    """A pool with z down is refused, since heading and depth are fused about a z that points up."""
     pool.write_text(POOL.replace("{height: 1.0}", "{normal: [0, 0, -1], point: [0, 0, 0.2]}"))
     with pytest.raises(LocalizationError, match="survey the pool with z up"):
         site_of(replace(load_pool(pool), world_orientation=(1.0, 0.0, 0.0, 0.0)), FINSROV)

@@ -62,12 +62,12 @@ def test_outliers_in_between_do_not_stop_a_run():
 
 
 def test_the_run_may_move():
-    """Measurements of a vehicle that moves while it is refused are consistent."""
+    """Measurements of a vehicle that moves while it is refused count as consistent."""
     assert refused(OutlierGate(), [(5.0 + 0.03 * k, 1.0) for k in range(11)])[-1] == "reacquired"
 
 
 def test_a_gate_that_never_gives_in():
-    """This is `reacquire_after` of infinity."""
+    """With `reacquire_after` of infinity, a run of refused measurements is never accepted."""
     assert set(refused(OutlierGate(reacquire_after=np.inf), [(5.0, 1.0)] * 100)) == {"gate"}
 
 

@@ -69,7 +69,7 @@ def test_the_covariance_is_that_of_the_errors(case):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", POOLS)
 def test_the_covariance_holds_everywhere(name):
-    """This includes other positions, windows and lenses."""
+    """The covariance is valid at other positions, behind windows and with other lenses."""
     position, angles = pose(name, 7)
     value = nees(POOLS[name], position, angles, CASES["all"], 300, np.random.default_rng(2))
     assert 3.0 - 0.49 < value < 3.0 + 0.64

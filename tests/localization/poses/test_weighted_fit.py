@@ -81,6 +81,6 @@ def test_unsure_corners_leave_the_depth_as_it_was_read():
 
 
 def test_without_depth_it_refuses():
-    """The fit needs every quantity that it weights."""
+    """The fit refuses without depth, as it needs every quantity that it weights."""
     found = weighted_fit(seen(POOL, POSITION, ANGLES), POOL, TAGS, None)
     assert not found.ok and "depth" in found.reason
