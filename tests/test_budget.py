@@ -62,7 +62,7 @@ def test_other_webp_and_tiff_headers_tell_their_size():
 
 
 def test_a_file_is_read_up_to_its_bound(tmp_path):
-    """A file that is one byte over the limit, and a device without end, are refused."""
+    """A file of exactly the limit is read; one that is a byte over the limit is refused."""
     path = tmp_path / "a"
     path.write_bytes(b"12345")
     assert budget.read_bytes(path, CalibrationError, limit=5) == b"12345"

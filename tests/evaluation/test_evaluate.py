@@ -93,7 +93,7 @@ def test_trials_are_those_of_the_protocol():
 
 
 PLANTS = [name for name in available_plants() if not load_plant(name).held_out]
-"""Plants of tasks without a camera."""
+"""Plants of tasks without perception."""
 
 
 @pytest.mark.slow

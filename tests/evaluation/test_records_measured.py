@@ -141,7 +141,8 @@ def test_a_run_that_ended_early_is_named_and_has_no_late_errors(tmp_path, capsys
 def test_a_record_of_a_vehicle_of_ones_own_is_measured_by_the_file_that_it_keeps(
     tmp_path, capsys, monkeypatch
 ):
-    """A record is measured without --vehicle, from another directory, without the file; a missing vehicle is named."""
+    """A record is measured without --vehicle, from another directory, without the file; another vehicle is
+    refused."""
     own = tmp_path / "minnow.yaml"
     own.write_text("extends: finsrov\norigin: measured\nsource: test\nbody: {mass: 13.0}\n")
     minnow = load_vehicle(own)

@@ -85,7 +85,7 @@ def test_motors_that_stand_still_below_their_slowest_speed_are_not_weak():
 
 @pytest.mark.parametrize("end", (4.999999999999998, 5.0, 5.05))
 def test_times_that_are_rounded_are_thinned(end):
-    """The last multiple of a tenth of a second may lie a rounding error after the last sample."""
+    """Times are thinned to tenths of a second, even if the last lies a rounding error after the last sample."""
     segment = next(windows_of(driven(), VEHICLE))[0]
     t = np.linspace(0.0, end, 101)
     (thin, values) = _thinned(replace(segment, measured={"u": (t, t)})).measured["u"]

@@ -50,7 +50,7 @@ def test_a_fit_without_thrust_designs_nothing():
 
 @pytest.mark.slow
 def test_trials_that_measured_different_columns_get_a_dive_too():
-    """If one trial has depth and one has speed, the next dive measures both, and depth is not compared."""
+    """One trial with depth and one with speed, whose columns are not compared, still give a dive in heave."""
     plan = programmes("heave", VEHICLE, levels={"heave": (18.0,)}, coast=3.0)[:2]
     some = [
         simulate_programme([one], VEHICLE, seed=1, rate=20.0, columns=[own])[0]

@@ -36,7 +36,7 @@ def test_every_task_of_one_agent_is_registered():
 def test_a_task_of_one_agent_can_be_made_by_name(task):
     """`gymnasium.make` and `make_vec` find a task by the name of its class, and pass options on."""
     name, size = f"finssim/{TASKS[task].__name__}-v0", TASKS[task]().observation_size
-    # Agents of a team task are commanded by wrench.
+    # Tasks with other vehicles are commanded by wrench.
     action, wide = ("wrench6", 6) if TASKS[task]().others else ("thruster8", 8)
     env = gymnasium.make(name, action=action)
     assert env.reset(seed=1)[0].shape == (size,) and env.action_space.shape == (wide,)

@@ -78,8 +78,7 @@ def test_times_may_come_from_a_table(tmp_path):
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
 @pytest.mark.parametrize("share", [0.0, 0.02, 0.5, 0.95])
 def test_a_picture_cut_short_is_named_and_left_out(tmp_path, suffix, share):
-    """A cut picture is named and skipped, even where the decoder would fill the rest with gray; the number is
-    reported."""
+    """A cut picture is named, skipped and counted, even where the decoder would fill the rest with gray."""
     busy = RNG.integers(0, 255, (48, 64)).astype(np.uint8)
     for number in (1, 2, 3):
         write_picture(busy, tmp_path / f"{number}{suffix}")
