@@ -151,7 +151,7 @@ def test_a_missing_directory_or_file_is_named(folder):
     ("changes", "sentence"),
     [
         ({"format": 2}, "format is 2, but this version reads format 1"),
-        ({"colour": "red"}, "colour: Extra inputs are not permitted"),
+        ({"colour": "red"}, "colour: unknown key; known keys: format"),
         ({"control_period": -0.1}, "control_period: Input should be greater than or equal to 0.001"),
         ({"control_period": 1e-9}, "control_period: Input should be greater than or equal to 0.001"),
         ({"memory": 10**12}, "memory: Input should be less than or equal to 1048576"),

@@ -88,8 +88,8 @@ def test_a_plant_that_is_not_there_is_told_before_any_training(tmp_path):
         ({"seeds": [1, 1]}, "expected at least one, each once"),
         ({"evaluate": {"trials": 0}}, "evaluate.trials: Input should be greater than or equal to 1"),
         ({"evaluate": {"plants": []}}, "evaluate.plants: Tuple should have at least 1 item"),
-        ({"tusk": "t1"}, "tusk: Extra inputs are not permitted"),
-        ({"search": {"trials": 3}}, "search: Extra inputs are not permitted"),
+        ({"tusk": "t1"}, "tusk: unknown key, did you mean 'task'"),
+        ({"search": {"trials": 3}}, "search: unknown key; known keys: task"),
     ],
 )
 def test_what_cannot_be_is_refused(tmp_path, changes, sentence):

@@ -183,10 +183,10 @@ def test_a_water_file_finds_its_table_and_refuses_unknown_words(table, tmp_path)
     water = load_water(path)
     assert water.profile.depths == (0.0, 5.0, 20.0) and len(water.components) == 24 and water.moving
     path.write_text("curent: profile.csv\n")
-    with pytest.raises(SurroundingsError, match=r"water.yaml: water.curent: Unexpected"):
+    with pytest.raises(SurroundingsError, match=r"water.yaml: curent: unknown key, did you mean .current"):
         load_water(path)
     path.write_text("waves: {spectrum: jonswap, hight: 0.3, height: 1.0, period: 3.5}\n")
-    with pytest.raises(SurroundingsError, match=r"hight: Unexpected"):
+    with pytest.raises(SurroundingsError, match=r"hight: unknown key"):
         load_water(path)
     plant = tmp_path / "plant.yaml"
     plant.write_text("water: {current: profile.csv, depth: 20.0}\n")

@@ -162,7 +162,7 @@ def read_description(folder: Path) -> PolicyDescription:
     try:
         return PolicyDescription.model_validate(data)
     except ValidationError as error:
-        raise PolicyError(f"{path}: {first_problem(error)}") from error
+        raise PolicyError(f"{path}: {first_problem(error, PolicyDescription)}") from error
 
 
 def plain_data(value: Any) -> Any:

@@ -1,10 +1,11 @@
 """Reader of untrusted YAML and JSON of bounded size, which reports errors in one sentence, and writer of YAML."""
 
+import difflib
 import json
 import re
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, cast, get_args
 
 import yaml
 
@@ -223,16 +224,39 @@ def read_mapping(
     return tree
 
 
-def first_problem(error: Any) -> str:
+def first_problem(error: Any, model: Any) -> str:
     """Return the first error that Pydantic found in data from a file, as `location: error`.
 
     Args:
         error: A `pydantic.ValidationError`.
+        model: The Pydantic model of the data, whose keys are listed if one is unknown.
     """
     problem = error.errors()[0]
     # Names of alternatives, which begin with a bracket, are not part of the location.
     parts = [str(part) for part in problem["loc"] if not str(part).startswith("(")]
     location, message = ".".join(parts), str(problem["msg"]).removeprefix("Value error, ")
-    if problem["type"] == "literal_error":
-        message = f"is {problem['input']!r}, expected {problem['ctx']['expected']}"
+    kind, value = problem["type"], problem.get("input")
+    if kind == "literal_error":
+        message = f"is {value!r}, expected {problem['ctx']['expected']}"
+    elif kind == "missing":
+        message = "is missing: add it"
+    elif kind in ("extra_forbidden", "unexpected_keyword_argument"):
+        known = _keys(model, parts[:-1])
+        close = difflib.get_close_matches(parts[-1], known, n=1)
+        message = f"unknown key, did you mean '{close[0]}'?" if close else "unknown key;"
+        message = f"{message} known keys: {', '.join(known)}" if known else "unknown key: remove it"
+    elif kind != "value_error" and isinstance(value, str | float | int | None):
+        message = f"{message}, found {value!r}"
     return f"{location}: {message}" if location else message
+
+
+def _keys(model: Any, path: Sequence[str]) -> list[str]:
+    """Return the keys of the model or dataclass at a path, also in lists and optional sections; none if unclear."""
+    for step in path:
+        if not step.isdigit():
+            fields = getattr(model, "model_fields", None) or getattr(model, "__dataclass_fields__", {})
+            field = fields.get(step)
+            model = getattr(field, "annotation", None) or getattr(field, "type", None)
+        while inner := [part for part in get_args(model) if part not in (type(None), Ellipsis)]:
+            model = inner[0]
+    return list(getattr(model, "model_fields", None) or getattr(model, "__dataclass_fields__", {}))

@@ -166,4 +166,4 @@ def load_plant(name_or_path: str | Path) -> PlantChanges:
     try:
         return PlantChanges.model_validate({"name": path.stem, **data})
     except ValidationError as error:
-        raise PlantError(f"{path}: {first_problem(error)}") from None
+        raise PlantError(f"{path}: {first_problem(error, PlantChanges)}") from None

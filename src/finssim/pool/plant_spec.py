@@ -463,4 +463,4 @@ def load_plant_spec(path: str | Path) -> PlantSpec:
     try:
         return PlantSpec.model_validate(data)
     except ValidationError as error:
-        raise PlantSpecError(f"{path}: {first_problem(error)}") from None
+        raise PlantSpecError(f"{path}: {first_problem(error, PlantSpec)}") from None

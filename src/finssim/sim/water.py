@@ -375,7 +375,7 @@ def load_water(path: str | Path) -> Water:
     try:
         return WaterFile.model_validate({"water": beside(tree, path.parent)}).water
     except ValidationError as error:
-        raise SurroundingsError(f"{path}: {first_problem(error)}") from None
+        raise SurroundingsError(f"{path}: {first_problem(error, WaterFile).removeprefix('water.')}") from None
 
 
 def beside(water: Any, folder: Path) -> Any:

@@ -171,7 +171,7 @@ def load_sweep(path: str | Path) -> Sweep:
     try:
         sweep = Sweep.model_validate(data)
     except ValidationError as error:
-        raise SweepError(f"{path}: {first_problem(error)}") from error
+        raise SweepError(f"{path}: {first_problem(error, Sweep)}") from error
     for name in sweep.evaluate.plants:
         load_plant(name)
     return sweep
