@@ -395,10 +395,11 @@ class RowLaunch:
     """
 
     def __init__(self, kernel: Any, dtype: Any, data: Any) -> None:
-        """Args:
-        kernel: Kernel with an array of vectors, `data` and an array of vec8 as arguments.
-        dtype: Warp type of the vectors.
-        data: Warp struct on the CPU.
+        """
+        Args:
+            kernel: Kernel with an array of vectors, `data` and an array of vec8 as arguments.
+            dtype: Warp type of the vectors.
+            data: Warp struct on the CPU.
         """
         self._kernel, self._dtype, self._data = kernel, dtype, data
         self._record(1)  # a robot's first decision must not wait for the compiler

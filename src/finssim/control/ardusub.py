@@ -207,8 +207,9 @@ class Mixer:
     """
 
     def __init__(self, autopilot: Autopilot) -> None:
-        """Args:
-        autopilot: Autopilot with its frame and directions.
+        """
+        Args:
+            autopilot: Autopilot with its frame and directions.
         """
         self.autopilot = autopilot
         self.directions = autopilot.signs(len(autopilot.factors))

@@ -200,7 +200,8 @@ class Locator:
         method: str = "refractive",
         pixel_std: float = 0.5,
     ) -> None:
-        """Args:
+        """
+        Args:
             pool: Camera and water.
             vehicle: Vehicle with its tags.
             prior: Height and tilt over time.

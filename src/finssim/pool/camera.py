@@ -53,9 +53,10 @@ class CornerFit:
     """Tags of a vehicle: the sampled points of each, and the corners that the fit reports."""
 
     def __init__(self, family: str, tags: Sequence[int]) -> None:
-        """Args:
-        family: Name of the tags' family.
-        tags: Their ids.
+        """
+        Args:
+            family: Name of the tags' family.
+            tags: Their ids.
         """
         along = 0.5 - 0.5 * np.cos(np.pi * np.arange(NODES) / (NODES - 1))  # Chebyshev nodes, with the ends
         self._square = np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
@@ -152,10 +153,11 @@ class RippledView:
     """Projection from a point to its pixel, with the surface and the refraction of the renderer."""
 
     def __init__(self, camera: Camera, interface: Interface, ripples: Ripples | None = None) -> None:
-        """Args:
-        camera: Camera above the water.
-        interface: Still surface, without a window.
-        ripples: Same as in `sim.overhead_camera.Scene`; None for a flat surface.
+        """
+        Args:
+            camera: Camera above the water.
+            interface: Still surface, without a window.
+            ripples: Same as in `sim.overhead_camera.Scene`; None for a flat surface.
         """
         self.camera = camera
         self._frame = surface_frame(camera, interface)
@@ -300,12 +302,13 @@ class CornerCamera:
     def __init__(
         self, tags: Tags, site: Pool, ripples: Ripples | None, *, pixel_noise: float, seed: int
     ) -> None:
-        """Args:
-        tags: Tags with their true mounts.
-        site: True camera and water.
-        ripples: Ripples of the water; None for a flat surface.
-        pixel_noise: Standard deviation of a corner, per axis [px].
-        seed: Seed of the noise.
+        """
+        Args:
+            tags: Tags with their true mounts.
+            site: True camera and water.
+            ripples: Ripples of the water; None for a flat surface.
+            pixel_noise: Standard deviation of a corner, per axis [px].
+            seed: Seed of the noise.
         """
         self._noise, self._seed = pixel_noise, seed
         self._inside = site.camera.lens.inside
@@ -560,13 +563,14 @@ class PictureCamera:
         exposure: float,
         seed: int,
     ) -> None:
-        """Args:
-        tags: Tags with their true mounts.
-        site: True camera and water; the pool's floor is at z = 0 below its middle.
-        ripples: Ripples of the water; None for a flat surface.
-        basin: Basin of the pool.
-        exposure: [s]
-        seed: Seed of the noise.
+        """
+        Args:
+            tags: Tags with their true mounts.
+            site: True camera and water; the pool's floor is at z = 0 below its middle.
+            ripples: Ripples of the water; None for a flat surface.
+            basin: Basin of the pool.
+            exposure: [s]
+            seed: Seed of the noise.
         """
         self._tags, self._seed = tags, seed
         self._bitmaps = {tag: bitmap(tags.family, tag).astype(bool) for tag in tags.mounts}
@@ -643,7 +647,8 @@ class PoolCamera:
         seed: int = 0,
         noise_seed: int | None = None,
     ) -> None:
-        """Args:
+        """
+        Args:
             vehicle: Vehicle with tags.
             site: True camera and water, from `camera_of`.
             mode: pictures are rendered; corners are computed by the same optics without a picture, with the detector's

@@ -34,10 +34,11 @@ class Medium:
         communication: Communication | None = None,
         seed: int = 0,
     ) -> None:
-        """Args:
-        positions: Function that returns the positions of all vehicles, by name, world frame [m], (3,).
-        communication: Speed of sound, processing time and loss; None delivers everything immediately.
-        seed: Seed of the losses.
+        """
+        Args:
+            positions: Function that returns the positions of all vehicles, by name, world frame [m], (3,).
+            communication: Speed of sound, processing time and loss; None delivers everything immediately.
+            seed: Seed of the losses.
         """
         self._positions, self._communication = positions, communication
         self._random = random.Random(f"medium {seed}")

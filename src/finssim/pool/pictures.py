@@ -45,7 +45,8 @@ class UdpSender:
     def __init__(
         self, bind: tuple[str, int], peer: tuple[str, int], *, fragment: int = LONGEST_FRAGMENT
     ) -> None:
-        """Args:
+        """
+        Args:
             bind: Address and port of this end; port 0 selects a free one (see `address`).
             peer: Address and port of the robot.
             fragment: Bytes of a picture in a datagram; 1400 for a network, larger only on this machine.

@@ -51,13 +51,14 @@ class Shutter:
     def __init__(
         self, *, rate: float, exposure: float, latency: float, jitter: float, dropout: float, seed: int
     ) -> None:
-        """Args:
-        rate: Picture rate [Hz].
-        exposure: [s].
-        latency: Mean time from the middle of the exposure to arrival [s].
-        jitter: Standard deviation of the latency [s]; pictures arrive in order.
-        dropout: Probability that a picture is lost.
-        seed: Seed of jitter and losses.
+        """
+        Args:
+            rate: Picture rate [Hz].
+            exposure: [s].
+            latency: Mean time from the middle of the exposure to arrival [s].
+            jitter: Standard deviation of the latency [s]; pictures arrive in order.
+            dropout: Probability that a picture is lost.
+            seed: Seed of jitter and losses.
         """
         self._rate, self._exposure, self._dropout = rate, exposure, dropout
         self._latency, self._jitter = latency, jitter
@@ -144,9 +145,10 @@ class Positioning:
     """Positioning system that measures the position of the vehicle and reports it with latency."""
 
     def __init__(self, settings: PositioningSettings, seed: int) -> None:
-        """Args:
-        settings: Settings of the system.
-        seed: Seed of noise, outliers, jitter and losses.
+        """
+        Args:
+            settings: Settings of the system.
+            seed: Seed of noise, outliers, jitter and losses.
         """
         s = settings
         self.settings = s

@@ -100,7 +100,8 @@ class ScriptedPilot:
         action: str | None = None,
         seed: int = 0,
     ) -> None:
-        """Args:
+        """
+        Args:
             task: A task with one vehicle among its `others`.
             vehicles: One vehicle for each role of the task.
             truth: Function that returns the true states of all vehicles, by role.

@@ -87,7 +87,8 @@ class RecordSink:
         chunk_seconds: float = 0.5,
         longest_queue: int = 64 << 20,
     ) -> None:
-        """Args:
+        """
+        Args:
             path: File to create; an existing one is refused.
             announce: Registers the channel of a key with an `mcap.writer.Writer` when its first message is written, and
                 returns its number.
@@ -235,7 +236,8 @@ class Recorder:
         epoch: float = 0.0,
         files: Mapping[str, Path | str] | None = None,
     ) -> None:
-        """Args:
+        """
+        Args:
             path: File to create; an existing one is refused.
             vehicle: Vehicle of the record.
             meta: Configuration, seed and other facts on the run: plain values, stored as JSON.

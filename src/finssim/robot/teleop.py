@@ -234,8 +234,9 @@ class Keys:
     """
 
     def __init__(self, hold: float = 0.6) -> None:
-        """Args:
-        hold: Time for which a key counts as held after its last press [s].
+        """
+        Args:
+            hold: Time for which a key counts as held after its last press [s].
         """
         if not 0.0 < hold <= 2.0:
             raise TeleopError(f"hold is {hold:g} s, expected above 0 and at most 2 s")
@@ -273,7 +274,8 @@ class Keyboard:
     """
 
     def __init__(self, stream: TextIO | None = None, hold: float = 0.6) -> None:
-        """Args:
+        """
+        Args:
             stream: A terminal; standard input if None.
             hold: See `Keys` [s].
 
@@ -421,9 +423,10 @@ class Gamepad:
     """
 
     def __init__(self) -> None:
-        """Raises:
-        TeleopError: No gamepad, or one with too few axes or buttons.
-        ModuleNotFoundError: pygame is not installed.
+        """
+        Raises:
+            TeleopError: No gamepad, or one with too few axes or buttons.
+            ModuleNotFoundError: pygame is not installed.
         """
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
         os.environ.setdefault("SDL_JOYSTICK_ALLOW_BACKGROUND_EVENTS", "1")

@@ -23,10 +23,11 @@ class Shutters:
     """Measurement and arrival times of each sensor of a vehicle."""
 
     def __init__(self, vehicle: Vehicle, names: Sequence[str], seed: int) -> None:
-        """Args:
-        vehicle: Vehicle whose `perception` describes the sensors.
-        names: Names of the sensors.
-        seed: Seed of the losses.
+        """
+        Args:
+            vehicle: Vehicle whose `perception` describes the sensors.
+            names: Names of the sensors.
+            seed: Seed of the losses.
         """
         self._shutters = {}
         for name in names:
@@ -63,7 +64,8 @@ class OnboardSensors:
         names: Sequence[str] | None = None,
         seed: int = 0,
     ) -> None:
-        """Args:
+        """
+        Args:
             vehicle: Vehicle that carries the sensors.
             world: Name of a site in the catalogue or a path, drawn from the seed; or one world as it is.
             names: Names of the sensors to compute; all of the vehicle if None.

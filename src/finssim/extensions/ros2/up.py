@@ -70,10 +70,11 @@ class Supervisor:
     """Runs the nodes of a plan. As a context manager, it ends all processes."""
 
     def __init__(self, plan: GraphPlan, parameters: Path, notify: Callable[[str], None]) -> None:
-        """Args:
-        plan: Nodes and namespaces.
-        parameters: File that `plan.write` wrote.
-        notify: Receives messages for the user.
+        """
+        Args:
+            plan: Nodes and namespaces.
+            parameters: File that `plan.write` wrote.
+            notify: Receives messages for the user.
         """
         self._plan, self._parameters, self._notify = plan, parameters, notify
         self.children: list[Child] = []

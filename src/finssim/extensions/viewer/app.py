@@ -80,9 +80,10 @@ class StageScene:
     """Draws frames of one stage."""
 
     def __init__(self, server: viser.ViserServer, stage: ViewStage) -> None:
-        """Args:
-        server: Server of the page.
-        stage: Part of the view that does not change.
+        """
+        Args:
+            server: Server of the page.
+            stage: Part of the view that does not change.
         """
         self._scene, self.stage = server.scene, stage
         self._scene.set_up_direction("+z")
@@ -407,10 +408,11 @@ class Playback:
     """Present time of the view in a source."""
 
     def __init__(self, duration: float, *, speed: float = 1.0, playing: bool = True) -> None:
-        """Args:
-        duration: Duration of the source [s]; infinite for a live one.
-        speed: Speed factor relative to real time.
-        playing: Whether it runs from the start.
+        """
+        Args:
+            duration: Duration of the source [s]; infinite for a live one.
+            speed: Speed factor relative to real time.
+            playing: Whether it runs from the start.
         """
         self.duration, self.speed, self.playing = duration, speed, playing
         self.time = 0.0
@@ -529,10 +531,11 @@ class Panel:
     """Controls and values of a stage."""
 
     def __init__(self, server: viser.ViserServer, stage: ViewStage, playback: Playback) -> None:
-        """Args:
-        server: Server of the page.
-        stage: Part of the view that does not change.
-        playback: Clock that the controls set.
+        """
+        Args:
+            server: Server of the page.
+            stage: Part of the view that does not change.
+            playback: Clock that the controls set.
         """
         self._server, self._gui, self._playback = server, server.gui, playback
         self._gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")

@@ -148,11 +148,12 @@ class Placeholder:
     duration = math.inf
 
     def __init__(self, vehicle: Vehicle, title: str, notice: str, *, placed: bool = True) -> None:
-        """Args:
-        vehicle: Vehicle to show.
-        title: Title of the view.
-        notice: Short text about what is being waited for.
-        placed: False hides the vehicle, if it is not yet known.
+        """
+        Args:
+            vehicle: Vehicle to show.
+            title: Title of the view.
+            notice: Short text about what is being waited for.
+            placed: False hides the vehicle, if it is not yet known.
         """
         deep = max(0.5, float(vehicle.body.size[2]))
         room = max(4.0, 3.0 * float(vehicle.body.size[0]))

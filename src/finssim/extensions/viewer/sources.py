@@ -84,7 +84,8 @@ class PoolSource:
         task: str | None = None,
         seed: int = 0,
     ) -> None:
-        """Args:
+        """
+        Args:
             guide: Goal or trajectory of the vehicle.
             plan: Pool; a vehicle with its own cameras and sonars starts at the viewpoint of their world.
             policy: Name of a PID, or a policy's directory.
@@ -240,7 +241,8 @@ class SimulatorSource:
         hydrodynamics: str = "calibrated",
         seed: int = 0,
     ) -> None:
-        """Args:
+        """
+        Args:
             vehicle: Vehicle to simulate.
             guide: Goal or trajectory of the vehicle.
             policy: Name of a PID, or a policy's directory.
@@ -366,7 +368,8 @@ class RecordSource:
         world: str | None = None,
         seed: int = 0,
     ) -> None:
-        """Args:
+        """
+        Args:
             path: Record file (.mcap).
             truth: Truth file of the pool.
             offset: Time of the robot's clock when the pool's is 0 [s]; None estimates it from both motions.
@@ -618,7 +621,8 @@ class RunSource:
     """One vehicle in one world of a recorded run."""
 
     def __init__(self, folder: Path | str, *, world: int | None = None, vehicle: str | None = None) -> None:
-        """Args:
+        """
+        Args:
             folder: Folder of the run.
             world: Index of the world; None is the first recorded one.
             vehicle: Name or file; None uses that of the run.

@@ -491,11 +491,12 @@ class RegionTracker:
     def __init__(
         self, detector: Detector, tags: Collection[int] | None = None, *, search_every: int = 15
     ) -> None:
-        """Args:
-        detector: Detector of tags in a picture or a region of it.
-        tags: Ids to detect; others are left out. None: all.
-        search_every: Number of pictures between searches of the full picture while a tag is missing (always if
-            `tags` is None). If no tag is detected at all, the full picture is searched at once.
+        """
+        Args:
+            detector: Detector of tags in a picture or a region of it.
+            tags: Ids to detect; others are left out. None: all.
+            search_every: Number of pictures between searches of the full picture while a tag is missing (always if
+                `tags` is None). If no tag is detected at all, the full picture is searched at once.
         """
         self._detector = detector
         self._tags = None if tags is None else frozenset(tags)

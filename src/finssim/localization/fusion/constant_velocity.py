@@ -67,9 +67,10 @@ class ConstantVelocity(Filter[PlaneTrack]):
     are always accepted."""
 
     def __init__(self, settings: Settings, site: Site) -> None:
-        """Args:
-        settings: Settings of the estimator.
-        site: Parameters of pool and vehicle.
+        """
+        Args:
+            settings: Settings of the estimator.
+            site: Parameters of pool and vehicle.
         """
         super().__init__(settings, site)
         self._H_height = np.array([[*site.up, 0.0, 0.0, 0.0]])

@@ -259,9 +259,10 @@ class ErrorState(Filter[InertialTrack]):
     """Error-state filter of one vehicle."""
 
     def __init__(self, settings: Settings, site: Site) -> None:
-        """Args:
-        settings: Settings of the estimator.
-        site: Parameters of pool and vehicle.
+        """
+        Args:
+            settings: Settings of the estimator.
+            site: Parameters of pool and vehicle.
         """
         super().__init__(settings, site)
         self._before = ConstantVelocity(settings, site)

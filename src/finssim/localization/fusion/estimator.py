@@ -58,9 +58,10 @@ class Timeline(Generic[S]):
     """
 
     def __init__(self, start: S, horizon: float) -> None:
-        """Args:
-        start: State before any sample.
-        horizon: Age up to which a late sample is accepted [s].
+        """
+        Args:
+            start: State before any sample.
+            horizon: Age up to which a late sample is accepted [s].
         """
         self.horizon = horizon
         self._ranks = {name: rank for rank, name in enumerate(("imu", *SENSORS))}
@@ -319,7 +320,8 @@ class Estimator:
     def __init__(
         self, settings: Settings | None = None, site: Site | None = None, *, mode: str = "constant-velocity"
     ) -> None:
-        """Args:
+        """
+        Args:
             settings: Tunable settings; None: the defaults.
             site: Parameters of pool and vehicle, made by `site_of`.
             mode: A name in `MODELS`.
@@ -474,8 +476,9 @@ class Fixes:
     """Converter from pictures with tags to position fixes."""
 
     def __init__(self, locator: TagLocator) -> None:
-        """Args:
-        locator: Locator that measures the poses.
+        """
+        Args:
+            locator: Locator that measures the poses.
         """
         self._locate = locator
 

@@ -192,9 +192,10 @@ class Filter(ABC, Generic[T]):
     """Sensor -> sensor whose gate is used for its readings, if different; None: all are accepted."""
 
     def __init__(self, settings: Settings, site: Site) -> None:
-        """Args:
-        settings: Settings of the estimator.
-        site: Parameters of pool and vehicle.
+        """
+        Args:
+            settings: Settings of the estimator.
+            site: Parameters of pool and vehicle.
         """
         self.settings, self.site = settings, site
 

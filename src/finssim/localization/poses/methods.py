@@ -321,7 +321,8 @@ class TagLocator:
     def __init__(
         self, pool: Pool, tags: Tags | None, *, method: str = "refractive", pixel_std: float = 0.5
     ) -> None:
-        """Args:
+        """
+        Args:
             pool: Camera and water.
             tags: Tags of the vehicle; None is refused.
             method: A name in `METHODS`.

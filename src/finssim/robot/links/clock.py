@@ -33,8 +33,9 @@ class ClockMap:
     """
 
     def __init__(self, window: float = 60.0) -> None:
-        """Args:
-        window: Age beyond which frames are not used for the comparison [s].
+        """
+        Args:
+            window: Age beyond which frames are not used for the comparison [s].
         """
         self.window = window
         self.drift = 0.0

@@ -70,11 +70,12 @@ class TelemetryLayout:
     its length is known."""
 
     def __init__(self, layout: Layout, outputs: int, others: int = 0, *, complete: bool = True) -> None:
-        """Args:
-        layout: The kind of frame.
-        outputs: Number of motor outputs of the vehicle.
-        others: Number of actuators of the vehicle besides thrusters.
-        complete: False: without the optional field.
+        """
+        Args:
+            layout: The kind of frame.
+            outputs: Number of motor outputs of the vehicle.
+            others: Number of actuators of the vehicle besides thrusters.
+            complete: False: without the optional field.
         """
         payload = layout.payload if complete else layout.payload[:-1]
         numbers = {0: outputs, OTHERS: others}
@@ -451,10 +452,11 @@ class Decoder:
     """
 
     def __init__(self, kinds: Iterable[Layout] = HOST, outputs: int = 8, others: int = 0) -> None:
-        """Args:
-        kinds: Layouts to decode, `HOST` or `MCU`.
-        outputs: Number of motor outputs of the vehicle (`vehicle.mcu.outputs`).
-        others: Number of actuators of the vehicle besides thrusters.
+        """
+        Args:
+            kinds: Layouts to decode, `HOST` or `MCU`.
+            outputs: Number of motor outputs of the vehicle (`vehicle.mcu.outputs`).
+            others: Number of actuators of the vehicle besides thrusters.
         """
         self.accepted: Counter[str] = Counter()
         self.refused: Counter[str] = Counter(bad_crc=0, bad_length=0, unknown_type=0, not_finite=0)
@@ -536,9 +538,10 @@ class McuLink:
     watched: tuple[tuple[str, ...], ...] = (("gyro",), ("accel",))
 
     def __init__(self, outputs: int, others: int = 0) -> None:
-        """Args:
-        outputs: Number of motor outputs of the vehicle (`vehicle.mcu.outputs`).
-        others: Number of actuators of the vehicle besides thrusters.
+        """
+        Args:
+            outputs: Number of motor outputs of the vehicle (`vehicle.mcu.outputs`).
+            others: Number of actuators of the vehicle besides thrusters.
         """
         self._decoder = Decoder(outputs=outputs, others=others)
         self.let_in: tuple[float, float] | None = None

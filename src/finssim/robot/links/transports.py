@@ -55,7 +55,8 @@ class UdpTransport:
         greeting: bytes = b"",
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Args:
+        """
+        Args:
             bind: Local address and port; port 0 selects a free one (see `address`).
             peer: Host and port of the other end; the name is resolved once. None: the first sender.
             longest: Bytes read of a datagram; a longer one is truncated, and its checksum no longer matches.
@@ -291,7 +292,8 @@ class SerialTransport:
         retry: float = 1.0,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Args:
+        """
+        Args:
             device: Path or name in the operating system.
             baud: Bits per second.
             retry: Time between attempts to open a lost device [s].

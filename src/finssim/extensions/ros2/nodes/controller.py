@@ -37,7 +37,8 @@ class Modes:
     """Control modes: PIDs by name, `policy` if a directory is given, and `teleop` by the topic `wrench_cmd`."""
 
     def __init__(self, node: RobotNode, policy: str, task: str) -> None:
-        """Args:
+        """
+        Args:
             node: Node that receives wrenches.
             policy: Initial mode: name of a PID, or directory of a policy.
             task: Task for which the policy must have been trained; empty: its own.

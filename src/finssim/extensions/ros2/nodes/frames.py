@@ -236,9 +236,10 @@ class Frames:
     """Publisher of all frames, in the one node that knows the vehicle's state."""
 
     def __init__(self, node: RobotNode, pool: Pool | None = None) -> None:
-        """Args:
-        node: Node that publishes the frames.
-        pool: Pool with the pose of the camera; None without a camera.
+        """
+        Args:
+            node: Node that publishes the frames.
+            pool: Pool with the pose of the camera; None without a camera.
         """
         self._node, self._odometer = node, Odometer()
         node.sends("transform", "fixed_transform", "robot")

@@ -29,10 +29,11 @@ class BridgeTopics:
     """Topics of a bridge: arming, stops and acknowledgements, which work with every middleware."""
 
     def __init__(self, node: RobotNode, bridge: Bridge, *, readings: bool = True) -> None:
-        """Args:
-        node: Node that subscribes and publishes.
-        bridge: The bridge.
-        readings: True to subscribe to the estimator; False if the node knows the state itself.
+        """
+        Args:
+            node: Node that subscribes and publishes.
+            bridge: The bridge.
+            readings: True to subscribe to the estimator; False if the node knows the state itself.
         """
         self._node, self._bridge = node, bridge
         self._publishers = self._matched = 0

@@ -64,9 +64,10 @@ class RemoteState:
     """Newest reading, in place of a `Perception`; a reading that is too old is not ready."""
 
     def __init__(self, node: RobotNode, oldest: float) -> None:
-        """Args:
-        node: Node that receives it.
-        oldest: Age above which a reading must not be used [s].
+        """
+        Args:
+            node: Node that receives it.
+            oldest: Age above which a reading must not be used [s].
         """
         # `robot.runtime.Intake` reads the format of a motor controller's frames, of which there are none here.
         self.vehicle, self.let_in = node.vehicle, None
@@ -102,9 +103,10 @@ class RemoteBridge:
     """True while arming waits for an autopilot; always False, since the state message does not contain it."""
 
     def __init__(self, node: RobotNode, source: Callable[[], str] | None = None) -> None:
-        """Args:
-        node: Node that subscribes and publishes.
-        source: Function that returns the signature of commands; None: the source passed with each command.
+        """
+        Args:
+            node: Node that subscribes and publishes.
+            source: Function that returns the signature of commands; None: the source passed with each command.
         """
         self._node, self._source = node, source
         self._state, self.reason, self._at = "disarmed", "", -math.inf
@@ -186,7 +188,8 @@ class Watcher(RobotNode):
     listening = LISTENING
 
     def __init__(self, plan: GraphPlan, namespace: str, *, arm: bool) -> None:
-        """Args:
+        """
+        Args:
             plan: Nodes that will be started, of which no others may exist.
             namespace: Namespace of the vehicle.
             arm: True to request arming when the state is ready and a controller exists, until it is granted once.

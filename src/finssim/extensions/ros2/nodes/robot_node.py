@@ -61,7 +61,8 @@ class RobotNode(Node):
     """True for nodes between sensor and thrusters, which get a higher process priority if permitted."""
 
     def __init__(self, name: str, others: Sequence[str] = (), arguments: Sequence[str] = ()) -> None:
-        """Args:
+        """
+        Args:
             name: Name of the node.
             others: Names of nodes that must not exist yet, besides its own.
             arguments: Further arguments for this node, as after --ros-args.
