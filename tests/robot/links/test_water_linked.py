@@ -292,10 +292,10 @@ def test_dead_reckoning_counts_from_its_reset(server):
     server.send(reports[-1])
     received(client, server)
     asked(client, server, "reset_dead_reckoning")
-    ahead = last | {"x": last["x"], "y": last["y"] - 1.0}
-    server.send(json.dumps(ahead).encode() + b"\n")
+    moved = last | {"x": last["x"] + 0.5, "y": last["y"] - 1.0}  # a metre ahead, half a metre to starboard
+    server.send(json.dumps(moved).encode() + b"\n")
     report = json.loads(received(client, server)[0])
-    assert (report["x"], report["y"]) == pytest.approx((1.0, 0.0), abs=0.1) and report[
+    assert (report["x"], report["y"]) == pytest.approx((1.0, 0.5), abs=0.1) and report[
         "yaw"
     ] == pytest.approx(0.0)
     client.close()
