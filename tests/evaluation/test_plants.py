@@ -102,6 +102,7 @@ def test_any_number_of_the_vehicle_can_differ(tmp_path):
         ("ranges: hold", "plant.yaml: ranges: no ranges 'hold'"),
         ("ranges: {mass: [2, 1]}", "plant.yaml: ranges.*name"),
         ("water: {current: [0.1, 0]}", "water.current.2: is missing"),
+        ("water: {current: 0.1}", "water.current: is 0.1, expected a list of values"),
         ("water: {flow: 1}", "water.flow: unknown key; known keys: current, shear"),
         ("water: {waves: 3}", "water.waves: Input should be an instance of Sequence"),
         ("water: {waves: [{amplitude: 1, wavelength: 2}]}", "a linear wave breaks"),

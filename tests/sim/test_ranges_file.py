@@ -23,7 +23,7 @@ FILES = {
     "unknown tag": (b"title: x\nmass: !kg 2\n", "line 2: not valid YAML: "),
     "key twice": (b"title: x\ntitle: y\n", "line 2: not valid YAML: key 'title' is given twice"),
     "list": (b"- 1\n", "found a list"),
-    "words": (b"hello\n", "found a str"),
+    "words": (b"hello\n", "found plain text"),
     "empty": (b"", "found nothing"),
 }
 

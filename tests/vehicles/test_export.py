@@ -104,6 +104,8 @@ def test_the_command_lists_what_is_not_held(tmp_path, monkeypatch, capsys):
     assert any("reference point [0.0, 0.0, -0.08]" in line for line in lines)
     assert boundary.run(app, ["vehicles", "export", "finsrov", "--out", "rov.txt"]) == 2
     assert "expected .sdf, as the format" in capsys.readouterr().err
+    assert boundary.run(app, ["vehicles", "export", "finsrov", "--format", "sdff", "--out", "rov.sdf"]) == 2
+    assert "unknown format 'sdff'; available: sdf, urdf" in capsys.readouterr().err
     with pytest.raises(VehicleError, match="the set 'mesh' is based on a mesh"):
         export_vehicle(load_vehicle("finsrov"), tmp_path / "rov.sdf", "sdf", "mesh")
 

@@ -496,6 +496,9 @@ def test_other_files_are_refused(tmp_path):
     (tmp_path / "a.txt").write_text("nothing")
     with pytest.raises(VehicleError, match="has an unknown format, expected one of SDF of gz-sim"):
         read_foreign(tmp_path / "a.txt")
+    (tmp_path / "rov.yaml").write_text("extends: finsrov\n")
+    with pytest.raises(VehicleError, match="needs no import: give it with --vehicle"):
+        read_foreign(tmp_path / "rov.yaml")
     with pytest.raises(VehicleError, match="no such file"):
         read_foreign(tmp_path / "b.sdf")
 

@@ -264,6 +264,8 @@ def export(
     from finssim.vehicles.export import export_vehicle
 
     kind = format or ("urdf" if out is not None and out.suffix == ".urdf" else "sdf")
+    if kind not in ("sdf", "urdf"):
+        raise ValueError(f"unknown format '{kind}'; available: sdf, urdf")
     vehicle = load_vehicle(name)
     file = out or Path(f"{vehicle.name}.{kind}")
     if file.suffix != f".{kind}":

@@ -219,7 +219,8 @@ def read_mapping(
     except yaml.YAMLError as error:
         raise refuse(f"{name}: not valid YAML: {' '.join(str(error).split())}") from None
     if not isinstance(tree, dict):
-        actual = "nothing" if tree is None else f"a {type(tree).__name__}"
+        names = {"NoneType": "nothing", "str": "plain text", "list": "a list"}
+        actual = names.get(type(tree).__name__, f"the value {tree!r}")
         raise refuse(f"{name}: expected keys such as '{such_as}', found {actual}")
     return tree
 
@@ -240,6 +241,8 @@ def first_problem(error: Any, model: Any) -> str:
         message = f"is {value!r}, expected {problem['ctx']['expected']}"
     elif kind == "missing":
         message = "is missing: add it"
+    elif kind in ("tuple_type", "list_type"):
+        message = f"is {value!r}, expected a list of values"
     elif kind in ("extra_forbidden", "unexpected_keyword_argument"):
         known = _keys(model, parts[:-1])
         close = difflib.get_close_matches(parts[-1], known, n=1)

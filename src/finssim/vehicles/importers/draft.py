@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from finssim.core.importer import importers
 from finssim.core.mesh import Faces, MeshError, Vertices, write_stl
-from finssim.core.yaml_file import yaml_text
+from finssim.core.yaml_file import read_mapping, yaml_text
 from finssim.vehicles.importers.elements import Element
 from finssim.vehicles.importers.rigid import plain
 from finssim.vehicles.loader import checked, importer_of
@@ -140,7 +140,15 @@ def read_foreign(path: Path, folders: Sequence[Path] = ()) -> Draft:
     if importer is not None:
         return importer.read(path, folders) if importer.folders else importer.read(path)
     known = ", ".join(sorted(member.title for member in importers("vehicle").values()))
-    raise VehicleError(f"{path}: has an unknown format, expected one of {known}")
+    hint = ""
+    if path.suffix in (".yaml", ".yml"):
+        keys = read_mapping(path, VehicleError, such_as="body: {mass: 11.2}").keys()
+        hint = (
+            "; a vehicle file of FinsSim needs no import: give it with --vehicle"
+            if keys & {"body", "extends"}
+            else ""
+        )
+    raise VehicleError(f"{path}: has an unknown format, expected one of {known}{hint}")
 
 
 NO_FORCE = {"visual", "sensor", "light", "surface", "laser_retro", "max_contacts", "self_collide"}
