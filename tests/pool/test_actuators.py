@@ -29,7 +29,8 @@ COMMAND = np.array([0.2, -0.15, 6e-4, 0.03])
 
 @pytest.mark.slow
 def test_a_nominal_torpedo_moves_as_the_engine_does():
-    """All actuators and the terms of its hull: the simulation that gets its thrust follows it for five seconds."""
+    """The simulation with all actuators and hull terms, given the plant's thrust, follows the plant for five
+    seconds."""
     plant = Plant(TORPEDO, NOMINAL, start=((0.0, 0.0, -8.0), (0.0, 0.0, 0.0, 1.0)))
     engine = Simulator(TORPEDO, control_step=plant.step, substeps=1)
     engine.plant.time_constant.numpy()[..., 0] = 0.0
@@ -49,7 +50,7 @@ def test_a_nominal_torpedo_moves_as_the_engine_does():
 
 
 def test_a_drawn_actuator_is_not_quite_that_of_the_file():
-    """Gain and offset lie between its sensor, which shows what was asked for, and its value; seeds keep their draws."""
+    """Gain and offset act between an actuator's sensor, which shows the request, and its value; seeds repeat."""
     spec = draw_plant(TORPEDO, 3, "hard")
     assert spec == draw_plant(TORPEDO, 3, "hard") and set(spec.actuators) == set(TORPEDO.actuators)
     assert spec.terms["surge_damping"] != 1.0
@@ -63,7 +64,8 @@ def test_a_drawn_actuator_is_not_quite_that_of_the_file():
 
 
 def test_the_axes_of_a_slender_hull_are_hardly_tilted():
-    """Tilt, centre and trim are drawn in proportion to beam over length: the rudder is stronger than the added mass."""
+    """Tilt, centre and trim are drawn in proportion to beam over length: otherwise added mass would outweigh
+    the rudder."""
     remus = load_vehicle("remus100")
     spec, share = draw_plant(remus, 3, "hard"), 0.191 / 1.33
     assert 0.0 < np.abs(spec.added_mass.tilt_deg).max() < 6.0 * share
@@ -72,7 +74,8 @@ def test_the_axes_of_a_slender_hull_are_hardly_tilted():
 
 
 def test_a_term_of_a_drawn_plant_is_stronger_or_weaker_than_in_the_file():
-    """Its factor scales the wrench: a plant whose damping is the term alone slows down so much faster."""
+    """The term's factor scales its wrench: a plant damped by this term alone slows down faster by that
+    factor."""
     spec = draw_plant(TORPEDO, 3, "nominal")
     slowed = []
     for factor in (1.0, 1.5):
@@ -88,7 +91,7 @@ def test_a_term_of_a_drawn_plant_is_stronger_or_weaker_than_in_the_file():
 
 
 def test_plants_of_other_actuators_are_refused():
-    """One sentence names both sides."""
+    """One sentence names the actuators of both sides."""
     other = torpedo(rudder=TORPEDO.actuators["rudder"].model_dump())
     with pytest.raises(
         PlantSpecError, match="has the actuators rudder, elevator, engine, battery, but torpedo has"
@@ -100,11 +103,11 @@ def test_plants_of_other_actuators_are_refused():
         )
 
 
-# Through the wire: what is commanded comes out in the plant, and its values come back.
+# Over the wire: commands reach the plant, and actuator values come back.
 
 
 def exchanged(pool, until, command=None):
-    """Newest telemetry of a pool that is sent a command 50 times a second up to a time [s]."""
+    """Return the newest telemetry of a pool that is sent a command 50 times a second until a time [s]."""
     decoder, newest = Decoder(HOST, 1, 4), None
     while pool.time < until - 1e-6:
         sent = [] if command is None else [encode_command(command)]
@@ -114,7 +117,8 @@ def exchanged(pool, until, command=None):
 
 
 def test_actuators_follow_the_wire_and_stop_when_it_falls_silent():
-    """Setpoints of version 2 move them and telemetry has their values; after the timeout fins go to 0, others stay."""
+    """Setpoints of version 2 move them and telemetry reports values; after the timeout fins go to 0, others
+    keep theirs."""
     pool = VirtualPool(TORPEDO, NOMINAL, start=((0.0, 0.0, -8.0), (0.0, 0.0, 0.0, 1.0)))
     heard = exchanged(pool, 2.0, ThrusterCommand(True, (0.3,), (0.2, -0.15, 2e-4, 0.02)))
     np.testing.assert_allclose(heard.actuators, [0.196, -0.15, 2e-4, 0.02], atol=1e-5)
@@ -125,7 +129,7 @@ def test_actuators_follow_the_wire_and_stop_when_it_falls_silent():
 
 
 def test_a_moving_engine_stops_where_it_is_when_motors_are_switched_off():
-    """Its rate is 2e-4 m³/s: one second on its way, then disabled."""
+    """The engine moves at 2e-4 m³/s for one second before it is disabled."""
     pool = VirtualPool(TORPEDO, NOMINAL, start=((0.0, 0.0, -8.0), (0.0, 0.0, 0.0, 1.0)))
     exchanged(pool, 1.0, ThrusterCommand(True, (0.0,), (0.0, 0.0, 1e-3, 0.0)))
     heard = exchanged(pool, 2.0, ThrusterCommand(False, (0.0,), (0.0, 0.0, 1e-3, 0.0)))
@@ -133,7 +137,7 @@ def test_a_moving_engine_stops_where_it_is_when_motors_are_switched_off():
 
 
 def test_a_command_without_setpoints_is_a_bad_frame():
-    """Version 1 does not move a vehicle that has more than thrusters; the echo has the reason."""
+    """Version 1 does not move a vehicle that has other actuators than thrusters; the echo gives the reason."""
     firmware = Firmware(TORPEDO, NOMINAL)
     firmware.receive(0.0, encode_debug_config(1, 1, 1))
     (echo,) = Decoder(HOST, 1, 4).feed(
@@ -147,7 +151,7 @@ def test_a_command_without_setpoints_is_a_bad_frame():
 
 
 def test_an_autopilot_that_moves_thrusters_alone_is_refused():
-    """In the pool and at the robot's end: one sentence."""
+    """Pool and robot each refuse it in one sentence."""
     with pytest.raises(PlantSpecError, match="firmware ardusub moves only thrusters, but torpedo has rudder"):
         VirtualPool(TORPEDO, NOMINAL, firmware="ardusub")
     with pytest.raises(LinkError, match="mavlink moves only thrusters, but torpedo has rudder"):
@@ -155,7 +159,7 @@ def test_an_autopilot_that_moves_thrusters_alone_is_refused():
 
 
 def test_the_truth_holds_the_values(tmp_path):
-    """One column for each actuator, named in the header; none for a vehicle of thrusters alone."""
+    """There is one column for each actuator, named in the header; none for a vehicle of thrusters alone."""
     pool = VirtualPool(
         TORPEDO, NOMINAL, start=((0.0, 0.0, -8.0), (0.0, 0.0, 0.0, 1.0)), truth=tmp_path / "t.fst"
     )

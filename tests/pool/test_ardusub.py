@@ -1,4 +1,4 @@
-"""The emulated autopilot against pymavlink, in lock-step: what it answers, how it steers, when it stops."""
+"""Answers, steering and failsafes of the emulated autopilot, tested with pymavlink in lock-step."""
 
 import math
 
@@ -36,7 +36,8 @@ def ground():
 
 
 def test_all_parameters_come_on_request_and_a_set_one_is_answered(ground):
-    """Each index once, float by value with its own type; whole ones are rounded and limited, unknown ones ignored."""
+    """Each index comes once, with value and type; integers are rounded and limited, unknown parameters
+    ignored."""
     out = ground.run(5.0, mavlink.MAVLink_param_request_list_message(1, 1))
     values = [m for m in out if m.get_type() == "PARAM_VALUE"]
     assert sorted(m.param_index for m in values) == list(range(values[0].param_count))
@@ -54,7 +55,7 @@ def test_all_parameters_come_on_request_and_a_set_one_is_answered(ground):
 
 
 def test_commands_as_whole_numbers_and_for_others(ground):
-    """COMMAND_INT is performed; a command for another system has no answer."""
+    """COMMAND_INT is performed; a command for another system gets no answer."""
     ground.run(2.0)
     out = ground.run(0.2, mavlink.MAVLink_command_long_message(7, 1, ARM, 0, 1, 0, 0, 0, 0, 0, 0))
     assert not [m for m in out if m.get_type() == "COMMAND_ACK"] and not ground.firmware.armed
@@ -63,7 +64,7 @@ def test_commands_as_whole_numbers_and_for_others(ground):
 
 
 def test_streams_and_intervals(ground):
-    """A group by REQUEST_DATA_STREAM, one message by SET_MESSAGE_INTERVAL, -1 ends it, 0 goes back to SR0."""
+    """REQUEST_DATA_STREAM sets a group, SET_MESSAGE_INTERVAL one message; -1 stops it, 0 returns to SR0."""
     ground.run(1.0, mavlink.MAVLink_request_data_stream_message(1, 1, 10, 20, 1))
     count = lambda name, out: sum(m.get_type() == name for m in out)  # noqa: E731
     assert count("ATTITUDE", ground.run(2.0)) == pytest.approx(40, abs=1)
@@ -77,7 +78,7 @@ def test_streams_and_intervals(ground):
 
 
 def test_clocks_answer_and_file_transfer_is_refused(ground):
-    """So that a ground station does not wait for it."""
+    """The refusal keeps a ground station from waiting."""
     ground.run(
         0.2,
         mavlink.MAVLink_timesync_message(0, 77),
@@ -95,20 +96,21 @@ def test_arming_waits_for_the_gyroscope(ground):
 
 
 def test_with_every_check_an_origin_is_missed_after_arming(ground):
-    """ARMING_CHECK 1: the answer is failure, and the motors are armed all the same."""
+    """With ARMING_CHECK 1 the answer is failure, but the motors are armed nevertheless."""
     ground.run(1.5)
     ground.set(ARMING_CHECK=1, BATT_ARM_VOLT=0)
     assert ground.command(ARM, 1) == FAILED and ground.firmware.armed
 
 
 AXES = {"surge": (0, 1), "sway": (1, -1), "yaw": (5, -1), "heave": (2, 1)}
-"""Axis of MANUAL_CONTROL -> index of our body velocity and its sign for a positive stick."""
+"""Axis of MANUAL_CONTROL -> index of the body velocity and its sign for a positive stick."""
 
 
 @pytest.mark.parametrize("way", [1, -1])
 @pytest.mark.parametrize("axis", AXES)
 def test_each_axis_moves_the_vehicle_its_way(axis, way):
-    """Ahead, right, clockwise, up; nothing else moves as fast. With STABILIZE against the horizontals' pitch moment."""
+    """Ahead, right, clockwise or up; no other velocity is as large. STABILIZE counters the horizontals' pitch
+    moment."""
     ground = Ground().armed(STABILIZE)
     stick = {"surge": (500 * way, 0, 500, 0), "sway": (0, 500 * way, 500, 0)}
     stick |= {"heave": (0, 0, 500 + 250 * way, 0), "yaw": (0, 0, 500, 600 * way)}
@@ -122,7 +124,8 @@ def test_each_axis_moves_the_vehicle_its_way(axis, way):
 
 
 def test_six_thrusters_have_their_own_frame_and_directions():
-    """A BlueROV2 without compass and log: frame 1, no pitch, the mixer's limits; MOT_n_DIRECTION turns a motor."""
+    """A BlueROV2 without compass and log: frame 1, no pitch, the mixer's limits; MOT_n_DIRECTION reverses a
+    motor."""
     rov = load_vehicle("bluerov2")
     ground = Ground(vehicle=rov, spec=draw_plant(rov, 1, "nominal"), start=(0.0, 0.0, -0.5)).armed()
     assert ground.firmware.parameters["FRAME_CONFIG"] == 1.0 and not ground.lines
@@ -135,7 +138,7 @@ def test_six_thrusters_have_their_own_frame_and_directions():
 
 @pytest.mark.parametrize("name, tilt", [("pitch", (150, 0)), ("roll", (0, 150))])
 def test_the_extension_axes_turn_it_about_the_other_two(name, tilt):
-    """s lifts the nose, t rolls to the right, as raw microseconds without the gain."""
+    """s lifts the nose and t rolls to the right, as raw microseconds without the gain."""
     ground = Ground().armed(gain=0.25)
     ground.tilt = tilt
     ground.run(0.3)
@@ -147,7 +150,8 @@ def test_the_extension_axes_turn_it_about_the_other_two(name, tilt):
 
 
 def test_the_gain_scales_sticks_and_buttons_change_it(ground):
-    """Half output for full stick by default; button 11 raises it by a quarter of the range, and says so."""
+    """A full stick gives half output by default; button 11 raises the gain by a quarter of the range and
+    reports it."""
     ground.axes = NEUTRAL
     ground.run(2.0, mavlink.MAVLink_request_data_stream_message(1, 1, 2, 5, 1))
     assert ground.command(ARM, 1) == ACCEPTED
@@ -194,7 +198,7 @@ def test_overrides_steer_without_gain_and_lapse_after_three_seconds(ground):
 
 
 def test_only_the_ground_station_of_its_id_steers():
-    """Another one may command, but its sticks do nothing."""
+    """Another station may send commands, but its sticks have no effect."""
     ground = Ground(system=200)
     ground.axes, ground.channels = (1000, 0, 500, 0), {5: 1900}
     ground.run(1.5)
@@ -204,7 +208,7 @@ def test_only_the_ground_station_of_its_id_steers():
 
 
 def test_without_a_pilot_it_disarms_after_three_seconds():
-    """FS_PILOT_INPUT 2: disarmed at once, and a heartbeat that says critical; the pilot's heartbeats do not save it."""
+    """FS_PILOT_INPUT 2 disarms, with a critical heartbeat, even if the pilot's heartbeats continue."""
     ground = Ground().armed()
     ground.axes = (1000, 0, 500, 0)
     ground.run(0.5)
@@ -218,7 +222,7 @@ def test_without_a_pilot_it_disarms_after_three_seconds():
 
 
 def test_a_low_battery_disarms_after_its_timer():
-    """BATT_LOW_TIMER 10 s below BATT_LOW_VOLT; both are off in the defaults."""
+    """BATT_LOW_TIMER is 10 s below BATT_LOW_VOLT; both are off by default."""
     ground = Ground().armed()
     ground.set(BATT_LOW_VOLT=12.8, BATT_FS_LOW_ACT=2)
     ground.pool.faults.autopilot.battery_voltage = 11.0
@@ -229,7 +233,7 @@ def test_a_low_battery_disarms_after_its_timer():
 
 
 def test_a_leak_is_reported_and_with_two_it_surfaces():
-    """FS_LEAK_ENABLE 1 warns and drives on, 2 goes up where it has a position, to SURFACE_DEPTH, and holds there."""
+    """FS_LEAK_ENABLE 1 only warns; 2 rises to SURFACE_DEPTH, if there is a position, and holds there."""
     ground = Ground().armed()
     ground.run(0.5, mavlink.MAVLink_set_gps_global_origin_message(1, 338103130, -1183938670, 0))
     ground.pool.faults.autopilot.leak = True
@@ -244,7 +248,8 @@ def test_a_leak_is_reported_and_with_two_it_surfaces():
 
 
 def test_stabilize_rights_it_and_holds_its_heading():
-    """From 25 degrees of roll and 15 of pitch, level to 4 degrees in 3 s, and the heading to 3."""
+    """From 25 degrees of roll and 15 of pitch, it is level to 4 degrees within 3 s, and its heading to 3
+    degrees."""
     ground = Ground(attitude=(0.45, 0.25, 1.0)).armed(STABILIZE)
     ground.run(3.0)
     roll, pitch, yaw = (float(a) for a in quat_to_euler(ground.pool.plant.quaternion.astype(float)))
@@ -253,7 +258,8 @@ def test_stabilize_rights_it_and_holds_its_heading():
 
 
 def test_depth_hold_holds_its_depth_and_climbs_by_the_stick():
-    """Within 5 cm over 10 s against 1 N of weight; up and down by the stick; held again where it is let go."""
+    """Depth stays within 5 cm over 10 s against 1 N of weight; the stick moves it, and depth is held from its
+    release."""
     ground = Ground().armed(ALT_HOLD, gain=0.5)
     ground.run(2.0)
     z = float(ground.pool.plant.position[2])
@@ -268,13 +274,13 @@ def test_depth_hold_holds_its_depth_and_climbs_by_the_stick():
 
 
 def versioned(version):
-    """The deep pool, with another version of the autopilot."""
+    """Return the deep pool with another version of the autopilot."""
     firmware = DEEP.firmware.model_copy(update={"version": version})
     return Ground(spec=DEEP.model_copy(update={"firmware": firmware}), start=(0.0, 0.0, -0.55))
 
 
 def test_version_4_7_has_other_names_and_little_throttle_near_the_surface():
-    """SURFACE_MAX_THR 0.1 at 10 cm, 1 a metre below that, and the system's own number by its new name."""
+    """SURFACE_MAX_THR is 0.1 at 10 cm and 1 a metre below that; the system id has its new name."""
     ground = versioned("4.7").armed(ALT_HOLD)
     assert (
         "SYSID_THISMAV" not in ground.firmware.parameters and ground.firmware.parameters["MAV_SYSID"] == 1.0
@@ -297,7 +303,7 @@ def test_version_4_1_knows_no_axes_of_pitch_and_roll():
 
 
 def test_the_version_is_an_option_of_the_pool():
-    """Of ArduSub alone: with the motor controller another one is refused."""
+    """The option applies to ArduSub alone: with the motor controller another version is refused."""
     plan, _ = SiteChoice(vehicle="bluerov2_heavy", firmware="ardusub", version="4.1").plan()
     assert plan.spec.firmware.version == "4.1"
     with pytest.raises(PlantSpecError, match="--firmware ardusub"):
@@ -305,12 +311,13 @@ def test_the_version_is_an_option_of_the_pool():
 
 
 def test_acro_turns_by_the_stick_and_rights_itself():
-    """Yaw rate of the stick, roll while it is held, and back to level without it; the throttle is the pilot's."""
+    """The stick sets yaw rate, and roll while it is held; without it the vehicle levels; throttle is the
+    pilot's."""
     ground = Ground().armed(ACRO, gain=0.5)
     ground.axes, ground.tilt = (0, 0, 500, 500), (0, 200)
     ground.run(2.0)
     roll, _, _ = (float(a) for a in quat_to_euler(ground.pool.plant.quaternion.astype(float)))
-    # A quarter of the range: 3.375 · 45° times what lies beyond the dead zone.
+    # A quarter of the range: 3.375 · 45° times the part beyond the dead zone.
     turn = -math.degrees(ground.pool.plant.nu[5])
     assert turn == pytest.approx(3.375 * 45.0 * (100 - 20) / (400 - 20), rel=0.2) and roll > math.radians(
         20.0
@@ -337,7 +344,7 @@ def test_surface_tracking_holds_the_depth_without_a_rangefinder():
 
 
 def test_after_a_reboot_under_water_depth_counts_from_there():
-    """Until it is calibrated at the surface, by command."""
+    """This lasts until a command calibrates depth at the surface."""
     ground = Ground(start=(0.0, 0.0, -2.0))
     ground.pool.reboot()
     ground.run(4.0, mavlink.MAVLink_request_data_stream_message(1, 1, 0, 10, 1))
@@ -346,13 +353,13 @@ def test_after_a_reboot_under_water_depth_counts_from_there():
 
 
 def test_the_heading_is_magnetic_until_there_is_an_origin():
-    """It turns by the declination in 20 s, as recorded."""
+    """Once there is an origin, the heading turns by the declination in 20 s, as recorded."""
     firmware = DEEP.firmware.model_copy(update={"declination": math.radians(11.4)})
     ground = Ground(spec=DEEP.model_copy(update={"firmware": firmware}), yaw=0.0)
     ground.run(3.0)
 
     def heading():
-        """Of the autopilot over the true one, clockwise [deg]."""
+        """Return the autopilot's heading minus the true one, clockwise [deg]."""
         true = -float(quat_to_euler(ground.pool.plant.quaternion.astype(float))[2])
         return math.degrees(ground.firmware._attitude[2] - true)
 
@@ -364,7 +371,8 @@ def test_the_heading_is_magnetic_until_there_is_an_origin():
 
 
 def test_telemetry_is_the_truth_in_north_east_down():
-    """Attitude, heading, depth, pressure, accelerations and battery, of a vehicle that stands tilted."""
+    """Attitude, heading, depth, pressure, accelerations and battery match the truth for a tilted vehicle at
+    rest."""
     level = HEAVY.model_copy(
         update={"body": HEAVY.body.model_copy(update={"center_of_buoyancy": np.zeros(3)})}
     )
@@ -390,7 +398,8 @@ def test_telemetry_is_the_truth_in_north_east_down():
 
 
 def test_its_own_position_comes_with_the_doppler_log_and_an_origin():
-    """Dead-reckoned north, east, down to 5 % of the way; without an origin, and without the log, there is none."""
+    """Dead-reckoned north, east, down is right to 5 % of the distance; without an origin or a log there is no
+    position."""
     ground = Ground(yaw=0.5).armed(STABILIZE)
     ground.run(0.1, mavlink.MAVLink_set_gps_global_origin_message(1, 338103130, -1183938670, 0))
     p0, n0 = ground.pool.plant.position.copy(), ground.firmware._position.copy()
@@ -415,8 +424,8 @@ def test_its_own_position_comes_with_the_doppler_log_and_an_origin():
 
 
 def test_late_instruments_count_by_the_attitude_of_then():
-    """Ahead while it spins: the log, 0.2 m ahead, is 60 ms late, the compass 20 ms. Its own position follows the truth,
-    and its heading lags by less than a degree."""
+    """The vehicle goes ahead while spinning; the log, 0.2 m ahead, is 60 ms late, the compass 20 ms. The autopilot's
+    position follows the truth, and its heading lags by less than a degree."""
     ground = Ground(vehicle=HEAVY.replace({"sensors.dvl.position": [0.2, 0.0, 0.0]})).armed(STABILIZE)
     ground.run(12.0, mavlink.MAVLink_set_gps_global_origin_message(1, 338103130, -1183938670, 0))
     p0, n0 = ground.pool.plant.position.copy(), ground.firmware._position.copy()
@@ -435,7 +444,7 @@ def test_late_instruments_count_by_the_attitude_of_then():
 
 
 def test_a_fault_of_depth_or_heartbeat_is_that_alone():
-    """The gauge stands while the rest moves; the vehicle's heartbeat goes missing and its telemetry does not."""
+    """A frozen gauge leaves the other sensors moving; a missing heartbeat leaves telemetry running."""
     ground = Ground().armed(ALT_HOLD)
     ground.run(0.5, mavlink.MAVLink_request_data_stream_message(1, 1, 0, 10, 1))
     ground.pool.faults.freeze_depth = True
@@ -451,7 +460,8 @@ def test_a_fault_of_depth_or_heartbeat_is_that_alone():
 
 
 def test_a_reboot_is_silent_and_keeps_nothing_but_parameters(ground):
-    """By command when disarmed only; motors off, clock from 0, MANUAL, gain read again."""
+    """A reboot by command needs a disarmed vehicle; then motors off, clock from 0, MANUAL, and the gain is
+    read again."""
     ground = ground.armed(STABILIZE, gain=1.0)
     assert ground.command(REBOOT, 1) == FAILED
     ground.command(ARM, 0)
@@ -468,7 +478,8 @@ def test_a_reboot_is_silent_and_keeps_nothing_but_parameters(ground):
 
 
 def test_signed_traffic_alone_counts_once_it_has_a_key(ground):
-    """SETUP_SIGNING stores the key; unsigned arming is not heard, signed is; what it sends verifies."""
+    """SETUP_SIGNING stores the key; unsigned arming is ignored, signed arming accepted; its own messages
+    verify."""
     key = list(range(1, 33))
     ground.run(1.5, mavlink.MAVLink_setup_signing_message(1, 1, key, 10**6))
     out = ground.run(0.3, mavlink.MAVLink_command_long_message(1, 1, ARM, 0, 1, 0, 0, 0, 0, 0, 0))
@@ -480,7 +491,7 @@ def test_signed_traffic_alone_counts_once_it_has_a_key(ground):
 
 
 def test_a_compass_turns_the_filter_and_nothing_else():
-    """`turn` by all of the difference gives the heading; tilt stays."""
+    """`turn` by the whole difference gives the heading; tilt does not change."""
     filter = AttitudeFilter(0.5, 0.01, 9.81)
     filter.update((0.0, 0.0, 0.0), (1.0, 2.0, 9.0), 0.01)
     before = [float(a) for a in quat_to_euler(np.array(filter.quaternion))]
@@ -490,7 +501,7 @@ def test_a_compass_turns_the_filter_and_nothing_else():
 
 
 def test_equal_seeds_send_equal_bytes():
-    """Nothing of the computer's clock is in them."""
+    """The bytes do not depend on the computer's clock."""
 
     def sent():
         ground = Ground()

@@ -54,7 +54,7 @@ def recorded(texts):
 
 
 def ready(**kwargs):
-    """A ground station that steers, on a vehicle whose gyroscope has settled."""
+    """Return a ground station that steers, on a vehicle whose gyroscope has settled."""
     ground = Ground(**kwargs)
     ground.axes = NEUTRAL
     ground.run(1.5)
@@ -62,7 +62,7 @@ def ready(**kwargs):
 
 
 def channels(ground):
-    """Inputs and pulses of channels 1 to 8."""
+    """Return inputs and pulses of channels 1 to 8."""
     return [list(ground.firmware._inputs[:8]), [int(pulse) for pulse in ground.firmware.pulses]]
 
 
@@ -88,7 +88,7 @@ def test_every_row_is_compared_or_left_with_a_reason():
 
 
 def test_streams_nobody_asked_for(ground):
-    """Each message at its rate, to 5 %: ArduSub's scheduler gives 2.08 Hz for 2."""
+    """Each message comes at its rate, to 5 %: ArduSub's scheduler gives 2.08 Hz for 2."""
     rates = Counter(m.get_type() for m in ground.run(24.0))
     asked = {name: rate for name, rate in RECORDED["default_streams_hz"].items() if name not in LEFT_STREAMS}
     asked.pop("TIMESYNC")  # one every 12 s
@@ -123,7 +123,7 @@ def test_heartbeat_version_and_number_of_parameters(ground):
 
 
 def test_parameters_have_the_recorded_values_and_types():
-    """Values by the file, in single precision, except those that describe the vehicle; RC3_TRIM is 1100."""
+    """Values equal the file's in single precision, except those that describe the vehicle; RC3_TRIM is 1100."""
     ground, sent = Ground(), {}
     out = ground.run(5.0, mavlink.MAVLink_param_request_list_message(1, 1))
     sent |= {m.param_id: (m.param_value, m.param_type) for m in out if m.get_type() == "PARAM_VALUE"}
@@ -138,7 +138,7 @@ def test_parameters_have_the_recorded_values_and_types():
 
 
 def test_storing_parameters(ground):
-    """Beyond the range of a stick's gain, truncated where whole, silence for unknown ones."""
+    """Stick gains beyond their range are stored, integers truncated, and unknown parameters get no answer."""
     assert ground.set(JS_GAIN_DEFAULT=2.0) == {"JS_GAIN_DEFAULT": RECORDED["pset_gain_2"]}
     assert ground.set(THR_DZ=99.6) == {"THR_DZ": RECORDED["pset_thr_dz_frac"]}
     assert RECORDED["param_set_unknown"] is None and ground.set(NO_SUCH=1.0) == {}
@@ -147,7 +147,8 @@ def test_storing_parameters(ground):
 
 
 def test_arming_and_disarming(ground):
-    """Accepted without an origin, with two warnings; again and twice over; the throttle of VFR_HUD is 50 and 0."""
+    """Arming is accepted without an origin, with two warnings, and repeatedly; throttle in VFR_HUD is 50 and
+    0."""
     out = ground.run(0.3, mavlink.MAVLink_command_long_message(1, 1, ARM, 0, 1, 0, 0, 0, 0, 0, 0))
     assert [m.result for m in out if m.get_type() == "COMMAND_ACK"] == RECORDED["arm_noorigin"]
     was_armed, texts = RECORDED["arm_noorigin_state"]
@@ -166,7 +167,7 @@ def test_arming_and_disarming(ground):
 
 
 def test_modes(ground):
-    """Each mode in turn, disarmed: result, mode afterwards, severities."""
+    """For each mode in turn, disarmed: result, mode afterwards, severities."""
     for mode, (result, after, texts) in RECORDED["modes_disarmed"].items():
         out = ground.run(
             0.15, mavlink.MAVLink_command_long_message(1, 1, MODE, 0, 1, int(mode), 0, 0, 0, 0, 0)
@@ -183,7 +184,7 @@ def test_modes(ground):
 
 
 def axes(name):
-    """Axes x, y, z, r, s, t of a name of `inputs`."""
+    """Return axes x, y, z, r, s, t of a name of `inputs`."""
     mixed = {
         "neutral": (0, 0, 500, 0, 0, 0), "mix1": (1000, 1000, 500, 1000, 0, 0), "mix2": (300, -200, 700, 150, 120, -90),
         "mix3": (0, 0, 1000, 0, 400, 400), "x32767": (32767,) * 6, "xm1000": (-1000, 0, 500, 0, 0, 0),
@@ -197,7 +198,7 @@ def axes(name):
 
 @pytest.mark.parametrize("name", RECORDED["inputs"])
 def test_inputs_and_outputs_to_the_microsecond(armed, name):
-    """MANUAL_CONTROL at a gain of 0.5: RC channels and servo outputs 1 to 8."""
+    """MANUAL_CONTROL at a gain of 0.5 gives the recorded RC channels and servo outputs 1 to 8."""
     x, y, z, r, s, t = axes(name)
     armed.axes, armed.tilt = (x, y, z, r), (s, t)
     armed.run(0.2)
@@ -208,7 +209,7 @@ def test_inputs_and_outputs_to_the_microsecond(armed, name):
 
 
 def test_strangers_and_other_targets_do_not_steer(armed):
-    """MANUAL_CONTROL of system 254, for target 2 and for target 0."""
+    """MANUAL_CONTROL of system 254, for target 2 and for target 0 has no effect."""
     armed.axes = None
     for row, system, target in (("other_sysid", 254, 1), ("wrong_target", 255, 2), ("target0", 255, 0)):
         other = mavlink.MAVLink(None, system, 190)
@@ -238,7 +239,8 @@ def test_overrides(armed, row, values):
 
 
 def test_buttons(ground):
-    """Each for 0.4 s, armed: function, kinds of texts, mode, armed. A mode is refused in each message."""
+    """Each is held for 0.4 s, armed: function, kinds of texts, mode, armed. A mode is refused in each
+    message."""
     ground.command(ARM, 1)
     for button, (function, texts, mode, stays) in RECORDED["buttons"].items():
         assert ground.firmware.parameters[f"BTN{button}_FUNCTION"] == function
@@ -268,11 +270,11 @@ COMMANDS = {
     "flight_term_0": (185, 0), "change_speed": (178, 0, 1), "cond_yaw": (115, 90), "storage_format": (526, 1),
     "run_prearm": (401,), "set_ekf_source": (42007, 1), "available_modes": (REQUEST, 435),
 }  # fmt: skip
-"""Rows of `commands` and what is sent."""
+"""Rows of `commands` and the messages sent for them."""
 
 
 def send(ground, number, *values, wait=2.5):
-    """Result of a command, None without an answer, and the severities of the texts."""
+    """Return the result of a command, None without an answer, and the severities of the texts."""
     values = [*values, *[0.0] * (7 - len(values))]
     out = ground.run(wait, mavlink.MAVLink_command_long_message(1, 1, number, 0, *values))
     acks = [m.result for m in out if m.get_type() == "COMMAND_ACK"]
@@ -280,7 +282,7 @@ def send(ground, number, *values, wait=2.5):
 
 
 def test_commands(ground):
-    """Acknowledgement and severities of each; the gyroscope's calibration answers after its 3 s."""
+    """Acknowledgement and severities match; the gyroscope's calibration answers after its 3 s."""
     assert set(COMMANDS) == set(RECORDED["commands"])
     for row, sent in COMMANDS.items():
         answer = send(ground, *sent, wait=2.5 if row == "preflight_cal_gyro" else 0.2)
@@ -292,7 +294,7 @@ def test_commands(ground):
 
 
 def test_commands_while_armed(ground):
-    """A motor is tested, ground pressure and reboot wait; what ends the test disarms."""
+    """A motor test runs, ground pressure and reboot are postponed; the end of the test disarms."""
     ground.command(ARM, 1)
     ground.run(0.6)
     sent = {
@@ -328,7 +330,8 @@ def test_missions_clocks_and_pings(ground):
 
 
 def test_a_motor_test_drives_single_outputs_and_cools_down(ground):
-    """Servo 1 by a pulse, then servo 3 by a percentage, each repeated; then disarmed, and 10 s without another."""
+    """Servo 1 by a pulse, then servo 3 by a percentage, each repeated; then it disarms and allows no test for
+    10 s."""
     result, first, then, both, after, texts = SECOND["motor_test"]
     ground.command(ARM, 1)
     ground.run(0.6)
@@ -344,7 +347,8 @@ def test_a_motor_test_drives_single_outputs_and_cools_down(ground):
 
 
 def test_the_ground_station_falls_silent(ground):
-    """Disarmed after 2.5 s with a critical heartbeat; disarmed, it only warns; sticks and overrides are heartbeats."""
+    """An armed vehicle disarms after 2.5 s with a critical heartbeat, a disarmed one warns; sticks and
+    overrides count too."""
     ground.command(ARM, 1)
     ground.run(1.0)
     for row in ("manual_control_is_heartbeat", "override_is_heartbeat"):
@@ -379,7 +383,7 @@ def test_the_ground_station_of_a_disarmed_vehicle_is_missed_with_a_word(ground):
 
 
 def test_what_refuses_to_arm(ground):
-    """No button that disarms, forced or not, and a low voltage."""
+    """A button that disarms, forced or not, does not prevent arming; nor does a low voltage."""
     ground.set(BTN4_FUNCTION=0)
     for row, values in (("arm_no_button", (ARM, 1)), ("force_no_button", (ARM, 1, 21196))):
         result, now_armed, texts = SECOND[row]
@@ -391,7 +395,7 @@ def test_what_refuses_to_arm(ground):
 
 
 def test_a_leak_is_a_word_and_no_more(armed):
-    """Armed, active and in its mode; later the vehicle is disarmed and in standby."""
+    """The armed vehicle stays active and in its mode; later, disarmed, it is in standby."""
     armed.pool.faults.autopilot.leak = True
     out = armed.run(1.2)
     armed.pool.faults.autopilot.leak = False
@@ -407,12 +411,12 @@ def test_a_leak_is_a_word_and_no_more(armed):
 
 
 def test_a_reboot_takes_its_time_and_is_confirmed(ground):
-    """Accepted when disarmed. The process of SITL took 25 s to come back, the emulated one its plant's reboot time."""
+    """It is accepted when disarmed. SITL took 25 s to return, the emulated autopilot its plant's reboot time."""
     assert send(ground, 246, 1, wait=0.05)[0] == SECOND["reboot"][0]
 
 
 RECORDED_HEAVY = HEAVY.replace({"body.displaced_volume": 0.0134})
-"""The vehicle of the recording, which sank by 1 N; the catalogue's has been trimmed to float since."""
+"""Vehicle of the recording, which sank by 1 N; the catalogue's has since been trimmed to float."""
 RECORDED_SPEC = draw_plant(RECORDED_HEAVY, 1, "nominal")
 RECORDED_SPEC = RECORDED_SPEC.model_copy(
     update={"basin": RECORDED_SPEC.basin.model_copy(update={"depth": 12.0})}
@@ -420,7 +424,7 @@ RECORDED_SPEC = RECORDED_SPEC.model_copy(
 
 
 def at_once(name):
-    """A deep pool of the vehicle with which the recording was made."""
+    """Return a deep pool with the vehicle of the recording."""
     ground = ready(spec=RECORDED_SPEC, start=(0.0, 0.0, -5.0), vehicle=RECORDED_HEAVY)
     assert ground.command(MODE, 1, name) == 0 and ground.command(ARM, 1) == 0
     ground.run(1.0)
@@ -428,7 +432,7 @@ def at_once(name):
 
 
 def state(ground):
-    """Roll, pitch, yaw [deg] and body rates [deg/s] in the autopilot's axes."""
+    """Return roll, pitch, yaw [deg] and body rates [deg/s] in the autopilot's axes."""
     plant = ground.pool.plant
     roll, pitch, yaw = (float(a) for a in quat_to_euler(plant.quaternion.astype(float)))
     rates = plant.nu[3:] * (1.0, -1.0, -1.0)
@@ -437,7 +441,8 @@ def state(ground):
 
 @pytest.mark.parametrize("name", SECOND["stabilize"])
 def test_stabilize_leans_and_turns_as_recorded(name):
-    """After 4.5 s: lean to 10 % (the other axis to 2 degrees), rate of turn to 10 % (or 1 degree a second)."""
+    """After 4.5 s lean agrees to 10 % (the other axis to 2 degrees), the rate of turn to 10 % (or 1 degree a
+    second)."""
     ground = at_once(STABILIZE)
     x, y, z, r, s, t = axes(name)
     ground.axes, ground.tilt = (x, y, z, r), (s, t)
@@ -451,7 +456,7 @@ def test_stabilize_leans_and_turns_as_recorded(name):
 
 @pytest.mark.parametrize("name", SECOND["althold_climb"])
 def test_depth_hold_climbs_as_recorded(name):
-    """Climb rate to 10 % (or 1 cm/s), throttle to 3 %, pulses to 25 µs."""
+    """Climb rate agrees to 10 % (or 1 cm/s), throttle to 3 %, pulses to 25 µs."""
     ground = at_once(ALT_HOLD)
     x, y, z, r, _, _ = axes(name)
     ground.axes = (x, y, z, r)
@@ -467,7 +472,7 @@ def test_depth_hold_climbs_as_recorded(name):
 
 
 def test_the_vertical_axis_alone_is_ramped_after_arming(ground):
-    """Servo 5 at full throttle 0.08 to 0.56 s after arming, to 15 µs; the others act at once."""
+    """Servo 5 at full throttle agrees to 15 µs from 0.08 to 0.56 s after arming; the others act at once."""
     ground.set(JS_GAIN_DEFAULT=1.0)
     ground.pool.reboot()
     ground.run(3.0)

@@ -1,4 +1,4 @@
-"""Frames and lines that nobody meant to send: neither end of the wire raises or arms. A sample of the benchmark."""
+"""Corrupted and forged frames and lines raise and arm at neither end of the wire. A sample of the benchmark."""
 
 import importlib.util
 from pathlib import Path
@@ -20,13 +20,13 @@ SPEC.loader.exec_module(fuzz)
     ids=["autopilot", "robot"],
 )
 def test_spoiled_and_forged_frames_neither_raise_nor_arm(play):
-    """About half with a right checksum; a good arming command would arm the vehicle behind."""
+    """About half have a valid checksum; a valid arming command would arm the vehicle."""
     counts = play()
     assert counts["exceptions"] == counts["armed"] == 0 and min(counts["damaged"], counts["forged"]) > 4000
 
 
 def test_the_frames_of_the_corpus_arm_as_they_are():
-    """So the test above would see it."""
+    """The test above is thus able to detect arming."""
     battery = SimpleNamespace(electric=np.array([16.0, 1.0]))
     for message in fuzz.ARMING:
         firmware = fuzz.ArduSub(fuzz.HEAVY, fuzz.SPEC)

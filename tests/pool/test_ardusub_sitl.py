@@ -1,4 +1,4 @@
-"""The physics behind ArduSub's SITL: golden packets, its lock-step rules, a stand-in as strict as SITL, and motion."""
+"""Physics for ArduSub's SITL: golden packets, lock-step rules, a stand-in as strict as SITL, and motion."""
 
 import json
 import math
@@ -49,7 +49,8 @@ PACKET = bytes.fromhex("1a48 9001 2a000000" + "dc05" * 15 + "6c07")
 
 
 def mixed(**demands):
-    """Pulses of ArduSub's mixer for VECTORED_6DOF, all motors turning as wired, from its published table."""
+    """Return the pulses of ArduSub's VECTORED_6DOF mixer from its published table, all motors turning as
+    wired."""
     table = {
         "roll": (0, 0, 0, 0, 1, -1, 1, -1),
         "pitch": (0, 0, 0, 0, -1, -1, 1, 1),
@@ -63,13 +64,13 @@ def mixed(**demands):
 
 
 class StandIn:
-    """SITL's side of the wire, as strict as the reference has it: `sitl_time` goes on as SITL's clock would."""
+    """SITL's side of the wire, as strict as the reference; `sitl_time` advances as SITL's clock would."""
 
     KEYS = (
         ("", "timestamp"), ("imu", "gyro"), ("imu", "accel_body"), ("", "position"), ("", "attitude"),
         ("", "quaternion"), ("", "velocity"), ("", "rng_1"), ("battery", "voltage"), ("battery", "current"),
     )  # fmt: skip
-    """Section and name of what is looked for."""
+    """Section and name of each value that is read."""
 
     def __init__(self, address, rate=400, silence=1.0):
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -86,7 +87,7 @@ class StandIn:
         self.sent += 1
 
     def step(self, pulses=STILL):
-        """One frame: send, wait in polls of 100 ms, send again after a second of silence; what the answer says."""
+        """Send one frame, poll every 100 ms, send again after a second of silence, and return the answer."""
         self.send(pulses)
         polls = 0
         while True:
@@ -103,7 +104,7 @@ class StandIn:
                 return self.advance(found)
 
     def parse(self):
-        """Only what lies between the last two newlines is read; what follows the last one is left."""
+        """Read only the text between the last two newlines; leave what follows the last one."""
         end = self.buffer.rfind(b"\n")
         begin = self.buffer.rfind(b"\n", 0, max(end, 0))
         if end < 0 or begin < 0:
@@ -113,7 +114,8 @@ class StandIn:
 
     @staticmethod
     def value(text, section, name):
-        """Plain searches: the section, the name after it, then right after quote and colon a number or an array."""
+        """Find by plain search the section, the name after it, then a number or an array right after quote
+        and colon."""
         at = text.index(section) + len(section)
         at = text.index(name, at) + len(name) + 2
         if text[at] != "[":
@@ -136,7 +138,7 @@ class StandIn:
 
 @pytest.fixture
 def serving():
-    """Makes servers that answer in a thread until the test ends; gives the server."""
+    """Function that starts a server in a thread until the test ends, and returns it."""
     running, threads = [True], []
 
     def start(world, **settings):
@@ -159,7 +161,7 @@ def serving():
 
 @pytest.fixture(scope="module")
 def shared():
-    """A neutral vehicle in open water, which tests put where they want."""
+    """A neutral vehicle in open water that tests place as they need."""
     return SitlWorld(NEUTRAL, start=DEEP)
 
 
@@ -177,7 +179,7 @@ def state_of(world):
 
 
 def test_the_golden_packets_of_both_sizes_are_read():
-    """As the reference has them, byte by byte."""
+    """The packets are those of the reference, byte by byte."""
     assert decode_pulses(PACKET) == Pulses(400, 42, (*[1500] * 15, 1900))
     big = bytes.fromhex("8173 b004 00000100" + "4c04" * 32)
     assert decode_pulses(big) == Pulses(1200, 65536, (1100,) * 32)
@@ -196,12 +198,13 @@ def test_the_golden_packets_of_both_sizes_are_read():
     ],
 )
 def test_other_packets_are_refused_with_a_word(data, reason):
-    """Nothing is raised."""
+    """The reason is returned and nothing is raised."""
     assert decode_pulses(data) == reason
 
 
 def test_the_answer_of_a_vehicle_at_rest_is_this_line():
-    """Every byte: newline, compact, the order of the names, specific force (0, 0, -9.80665), depth down, newline."""
+    """Every byte: newline, compact, the order of the names, specific force (0, 0, -9.80665), depth down,
+    newline."""
     world = SitlWorld(
         NEUTRAL, pool=RectangularPool(length=10.0, width=6.0, depth=5.0), start=Station((1.0, 0.5, -2.0), 0.0)
     )
@@ -213,7 +216,7 @@ def test_the_answer_of_a_vehicle_at_rest_is_this_line():
 
 
 def test_the_strict_parser_reads_what_a_json_reader_reads(world):
-    """In every field, of a vehicle that moves and turns."""
+    """This holds in every field, for a moving and turning vehicle."""
     for _ in range(50):
         world.step(mixed(forward=0.7, yaw=0.4, roll=0.5, throttle=-0.6), 100)
     line, client = world.answer(), StandIn(("127.0.0.1", 9))
@@ -231,7 +234,7 @@ def test_the_strict_parser_reads_what_a_json_reader_reads(world):
 
 
 def test_equal_counts_are_answered_without_stepping_lower_ones_start_again_gaps_go_on(world):
-    """The rules of the reference; the first frame may have any count."""
+    """These are the rules of the reference; the first frame may have any count."""
     server = SitlServer(world, ("127.0.0.1", 0))
     full = mixed(throttle=-1.0)
     first = server.answer(Pulses(400, 7, full))
@@ -259,7 +262,7 @@ def test_a_restarted_world_repeats_itself(world):
 
 @pytest.mark.slow
 def test_sitl_goes_through_four_hundred_frames_in_a_second_of_its_clock(world, serving):
-    """Each answered once; its own clock and ours agree, and the vehicle of SITL's channels moves."""
+    """Each frame is answered once, SITL's clock and the world's agree, and its channels move the vehicle."""
     server = serving(world)
     client = StandIn(server.address)
     for _ in range(400):
@@ -271,14 +274,14 @@ def test_sitl_goes_through_four_hundred_frames_in_a_second_of_its_clock(world, s
 
 
 def test_sitl_with_32_channels_is_answered(world, serving):
-    """Those beyond 16 drive nothing here."""
+    """Channels beyond 16 drive nothing here."""
     client = StandIn(serving(world).address)
     assert client.step((1500,) * 32)["timestamp"] == pytest.approx(1 / 400)
     client.socket.close()
 
 
 def test_packets_that_wait_get_one_answer(world):
-    """SITL takes one answer per frame: one that was sent again while we were slow is not answered twice."""
+    """SITL takes one answer per frame: a frame that was repeated while the server was slow is answered once."""
     server = SitlServer(world, ("127.0.0.1", 0))
     client = StandIn(server.address)
     for pulses in (STILL, STILL, mixed(throttle=-1.0)):
@@ -295,7 +298,7 @@ def test_packets_that_wait_get_one_answer(world):
 
 
 def test_bad_packets_and_strangers_are_counted_and_not_answered(world):
-    """Until SITL has been silent for a while: then another may come, as after its restart."""
+    """After SITL has been silent for a while another peer may connect, as after its restart."""
     now = [0.0]
     server = SitlServer(world, ("127.0.0.1", 0), clock=lambda: now[0])
     client, other = StandIn(server.address), StandIn(server.address)
@@ -318,7 +321,7 @@ def test_bad_packets_and_strangers_are_counted_and_not_answered(world):
 
 
 def test_a_taken_port_is_refused(world):
-    """With what to do."""
+    """The refusal says what to do."""
     server = SitlServer(world, ("127.0.0.1", 0))
     with pytest.raises(LinkError, match="for SITL"):
         SitlServer(world, server.address)
@@ -329,7 +332,7 @@ def test_a_taken_port_is_refused(world):
 
 
 def test_free_decay_is_the_simulators(world):
-    """With the motors off the state is that of a `Simulator` stepped directly, to the last bit."""
+    """With the motors off the state equals that of a `Simulator` stepped directly, to the last bit."""
     other = Simulator(NEUTRAL, control_step=1 / 400, substeps=1, threads=1)
     for simulator in (world.simulator, other):
         simulator.place((0.0, 0.0, -50.0), (0.0, 0.1, 0.0, 0.995), (0.8, -0.3, 0.2, 0.3, -0.2, 0.5))
@@ -341,7 +344,8 @@ def test_free_decay_is_the_simulators(world):
 
 
 def test_a_buoyant_vehicle_rises_at_its_terminal_speed():
-    """d1 w + d2 w² equals its net buoyancy; up is negative down, and at constant speed the force is that of rest."""
+    """d1 w + d2 w² equals its net buoyancy; up is negative down, and at constant speed the specific force is
+    that of rest."""
     body = HEAVY.body.model_copy(update={"displaced_volume": 0.0142})
     world = SitlWorld(HEAVY.model_copy(update={"body": body}), start=DEEP)
     for _ in range(1000):
@@ -354,7 +358,7 @@ def test_a_buoyant_vehicle_rises_at_its_terminal_speed():
 
 
 def test_forward_moves_it_along_its_heading():
-    """Turned 30° to the left, which is -30° in NED, it goes north and west."""
+    """Turned 30° to the left, which is -30° in NED, it moves north and west."""
     world = SitlWorld(NEUTRAL, start=Station((0.0, 0.0, -50.0), math.radians(30.0)))
     assert state_of(world)["attitude"][2] == pytest.approx(math.radians(-30.0), abs=1e-6)
     for _ in range(100):
@@ -365,7 +369,7 @@ def test_forward_moves_it_along_its_heading():
 
 
 def test_a_quarter_turn_to_the_right_points_east(world):
-    """Yaw demand is clockwise from above: gyro z and yaw grow; then forward goes east."""
+    """Yaw demand is clockwise from above: gyro z and yaw grow; then forward moves it east."""
     while (yaw := state_of(world)["attitude"][2]) < math.pi / 2:
         assert yaw > -0.01 and world.time < 10.0
         world.step(mixed(yaw=0.3), 100)
@@ -406,7 +410,8 @@ def test_velocity_is_the_integral_of_the_specific_force(world):
 
 
 def test_pulses_make_the_published_thrusts_at_the_batterys_voltage():
-    """1900 µs at 16 V pulls what the T200's table says; an empty battery gives less, a loaded one sags."""
+    """1900 µs at 16 V gives the thrust of the T200's table; an empty battery gives less, and a loaded one
+    sags."""
     stiff = SitlWorld(NEUTRAL, start=DEEP)
     weak = SitlWorld(NEUTRAL, start=DEEP, battery=Battery(full_voltage=13.0, resistance=0.02))
     pulses = (1900, 1100, 1500, 1520, 0, 1500, 1500, 1500)
@@ -420,7 +425,7 @@ def test_pulses_make_the_published_thrusts_at_the_batterys_voltage():
 
 
 def test_a_frame_rate_that_glides_keeps_time_and_motion(world):
-    """SITL changes its rate by 1 Hz per frame; the motion is that of a fixed rate."""
+    """SITL changes its rate by 1 Hz per frame; the motion equals that at a fixed rate."""
     elapsed = 0.0
     for rate in range(1200, 399, -1):
         world.step(mixed(forward=0.3), rate)
@@ -435,7 +440,7 @@ def test_a_frame_rate_that_glides_keeps_time_and_motion(world):
 
 
 def test_current_carries_it_away():
-    """A drifting vehicle ends with the water's velocity, in NED."""
+    """A drifting vehicle reaches the water's velocity, in NED."""
     world = SitlWorld(NEUTRAL, start=DEEP, water=Water(current=(0.2, 0.1, 0.0), depth=60.0))
     for _ in range(600):
         world.step(STILL, 20)
@@ -443,7 +448,7 @@ def test_current_carries_it_away():
 
 
 def test_the_doppler_log_beside_it_measures_the_same_world():
-    """Velocities in our axes of the log, altitude, and its latency as age, at 8 Hz of the world's clock."""
+    """Velocities in the log's own axes, altitude, and its latency as age come at 8 Hz of the world's clock."""
     log = DvlServer(("127.0.0.1", 0))
     client = DvlClient(*log.address)
     pool, water = (
@@ -470,7 +475,7 @@ def test_the_doppler_log_beside_it_measures_the_same_world():
 
 
 class Autopilot:
-    """ArduSub's end of a serial port over TCP: takes an origin once, and keeps what came."""
+    """ArduSub's end of a serial port over TCP; it accepts an origin once, and keeps what it receives."""
 
     def __init__(self):
         self.server, self.mav = TcpServer(("127.0.0.1", 0), bytearray), mavlink.MAVLink(None)
@@ -492,7 +497,7 @@ class Autopilot:
 
 
 def until(done, *turns):
-    """Turn until it is done, for at most 20 s."""
+    """Call the turns until done, for at most 20 s."""
     end = time.monotonic() + 20.0
     while not done() and time.monotonic() < end:
         for turn in turns:
@@ -502,7 +507,7 @@ def until(done, *turns):
 
 
 def test_ardusub_gets_its_origin_and_the_velocities_of_the_log():
-    """One origin per start of SITL; velocity times the time since the last, forward-right-down, with confidence; none
+    """One origin per start of SITL; displacement since the last report, forward-right-down, with confidence; none
     after a gap, and none faster than 20 Hz."""
     autopilot = Autopilot()
     forwarder = Forwarder(autopilot.server.address)
@@ -524,8 +529,9 @@ def test_ardusub_gets_its_origin_and_the_velocities_of_the_log():
 
 
 def test_both_ends_may_start_again(shared):
-    """SITL's new process counts from 0 from another port, after a silence: the world and the origin begin again. Our
-    new process takes the frame that SITL waits for: its time has gone back once, which SITL calls a physics reset."""
+    """After a silence SITL's new process counts from 0 from another port, and world and origin start again. A new
+    physics process accepts the frame that SITL is sending: its time goes back once, which SITL calls a physics reset.
+    """
     shared.restart()
     now, pulses = [0.0], mixed(throttle=-1.0)
     server = SitlServer(shared, ("127.0.0.1", 0), clock=lambda: now[0])
@@ -561,7 +567,7 @@ def test_both_ends_may_start_again(shared):
 
 @pytest.mark.slow
 def test_a_session_by_the_commands_of_the_page(tmp_path, capsys):
-    """A stand-in for ArduSub flies by its own position, which the forwarded log gives it; SIGTERM ends the physics with
+    """A stand-in for ArduSub flies by its own position from the forwarded log; SIGTERM ends the physics with
     its summary, and the true motion scores the record."""
     with socket.socket() as one, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         one.bind(("127.0.0.1", 0))
@@ -596,7 +602,7 @@ def test_a_session_by_the_commands_of_the_page(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_the_command_serves_until_its_time_is_over(capsys, tmp_path, monkeypatch):
-    """Its options reach the world, it says how SITL starts, and the end tells what came."""
+    """Its options reach the world, it prints how to start SITL, and it ends with a summary."""
     monkeypatch.chdir(tmp_path)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
@@ -634,7 +640,7 @@ def test_the_command_serves_until_its_time_is_over(capsys, tmp_path, monkeypatch
     ],
 )
 def test_each_version_gets_its_parameters(version, there, missing, tmp_path):
-    """Those of 4.5 are names that the recorded one has; another's file is not replaced."""
+    """The names for 4.5 are those of the recorded version; a file of another version is not replaced."""
     path = tmp_path / "a.parm"
     for _ in range(2):
         write_parameters(path, sitl_parameters(load_vehicle("bluerov2_heavy"), version, dvl=False))
@@ -652,7 +658,7 @@ def test_each_version_gets_its_parameters(version, there, missing, tmp_path):
 
 @pytest.mark.slow
 def test_one_command_starts_and_ends_sitl(tmp_path, monkeypatch, capsys):
-    """A program that notes its arguments stands for SITL; SIGTERM ends both with the summary."""
+    """A program that logs its arguments replaces SITL; SIGTERM ends both with the summary."""
     program = tmp_path / "sitl"
     program.write_text('#!/bin/sh\necho "$@" > started\nexec sleep 60\n')
     program.chmod(0o755)
@@ -672,7 +678,8 @@ def test_one_command_starts_and_ends_sitl(tmp_path, monkeypatch, capsys):
 
 
 def test_the_imu_has_the_files_noise_and_repeats_it(world):
-    """Rates of a vehicle at rest scatter by the density times the root of the rate; a restart draws the same."""
+    """At rest, rates scatter by the density times the root of the sample rate; a restart draws the same
+    noise."""
     noisy = SitlWorld(NEUTRAL, start=Station((0.0, 0.0, -1.0), 0.0), noise=True, seed=3)
     noisy.step(STILL, 400)
 
@@ -699,7 +706,7 @@ def test_the_imu_has_the_files_noise_and_repeats_it(world):
     ],
 )
 def test_the_command_refuses_what_cannot_be(words, capsys, tmp_path, monkeypatch):
-    """With one sentence."""
+    """Each invalid option is refused in one sentence."""
     monkeypatch.chdir(tmp_path)
     assert boundary.run(app, ["ardusub-sitl", *words.split()]) == 2
     assert "Traceback" not in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""The attitude filter finds tilt, follows turns and lets yaw drift."""
+"""The attitude filter finds tilt and follows turns; yaw drifts."""
 
 import math
 
@@ -15,7 +15,7 @@ def angles(attitude):
 
 
 def test_it_starts_at_the_tilt_that_gravity_shows():
-    """Roll and pitch from the first sample, yaw 0."""
+    """The first sample gives roll and pitch; yaw is 0."""
     attitude = AttitudeFilter(0.5, 0.01, 9.81)
     true = quat_from_euler(0.2, -0.3, 0.0)
     attitude.update((0.0, 0.0, 0.0), tuple(quat_inverse_rotate(true, UP)), 0.01)
@@ -23,7 +23,7 @@ def test_it_starts_at_the_tilt_that_gravity_shows():
 
 
 def test_it_follows_a_turn():
-    """A quarter turn of yaw at 1 rad/s is a quarter turn, to the step's second order."""
+    """A quarter turn of yaw at 1 rad/s is right to second order in the step."""
     attitude = AttitudeFilter(0.5, 0.01, 9.81)
     attitude.update((0.0, 0.0, 1.0), UP, 0.01)
     for _ in range(157):
@@ -32,7 +32,8 @@ def test_it_follows_a_turn():
 
 
 def test_tilt_is_held_against_a_gyro_bias_and_yaw_is_not():
-    """After ten minutes with 5 mrad/s on every axis tilt is right to a tenth of a degree, yaw 3 rad away."""
+    """After ten minutes with 5 mrad/s on every axis tilt is right to a tenth of a degree; yaw is off by 3
+    rad."""
     attitude = AttitudeFilter(0.5, 0.02, 9.81)
     for _ in range(60000):
         attitude.update((0.005, -0.005, 0.005), UP, 0.01)
@@ -43,7 +44,7 @@ def test_tilt_is_held_against_a_gyro_bias_and_yaw_is_not():
 
 
 def test_a_knock_is_not_taken_for_gravity():
-    """Specific forces of more than 1.3 g do not tilt it."""
+    """Specific forces of more than 1.3 g do not change the tilt."""
     attitude = AttitudeFilter(5.0, 0.0, 9.81)
     attitude.update((0.0, 0.0, 0.0), UP, 0.01)
     for _ in range(100):

@@ -1,4 +1,4 @@
-"""The virtual pool's camera: drawn pictures and computed corners tell a robot the same."""
+"""The virtual pool's camera: drawn pictures and computed corners give a robot the same data."""
 
 from dataclasses import replace
 
@@ -16,31 +16,31 @@ NOISE = CameraSettings().pixel_noise
 
 
 def pose_at(t):
-    """On an ellipse through the pool, rocking a little."""
+    """Return a pose on an ellipse through the pool, with slight rocking."""
     position = np.array([1.3 * np.cos(0.5 * t), 0.6 * np.sin(0.5 * t), -0.45 + 0.2 * np.sin(0.3 * t)])
     return position, quat_from_euler(0.05 * np.sin(3.0 * t), 0.04 * np.cos(2.0 * t), 0.7 * t)
 
 
 def at(x, y, z, roll=0.0, yaw=0.0):
-    """A vehicle that stands still."""
+    """Return the pose function of a vehicle at rest."""
     return lambda t: (np.array([x, y, z]), quat_from_euler(roll, 0.0, yaw))
 
 
 def camera(mode="corners", severity="nominal", seed=1, **changed):
-    """The camera of a plant, with some settings changed."""
+    """Return the camera of a plant, with some settings changed."""
     true, _, settings = camera_of(FINSROV, 1, severity)
     return PoolCamera(FINSROV, true, mode=mode, settings=replace(settings, **changed), seed=seed)
 
 
 def seen(eye, pose, duration=0.3):
-    """Ids of the tags in each picture of a still vehicle."""
+    """Return the ids of the tags in each picture of a vehicle at rest."""
     return [tuple(tag.tag_id for tag in p.tags) for p in eye.advance(0.0, duration, pose)]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("severity", "most"), [("nominal", 0.05), ("realistic", 0.1), ("hard", 0.25)])
 def test_computed_corners_are_those_found_in_drawn_pictures(severity, most):
-    """The same exposures, drawn and computed: rms difference per axis [px], without the computed ones' noise."""
+    """For equal exposures the rms difference per axis [px] is bounded, without the noise of computed corners."""
     drawn = camera("pictures", severity)
     computed = {
         p.sequence: p for p in camera("corners", severity, pixel_noise=0.0).advance(0.0, 12.0, pose_at)
@@ -64,7 +64,7 @@ def test_computed_corners_are_those_found_in_drawn_pictures(severity, most):
 
 
 def test_pixel_noise_is_that_given():
-    """The scatter of a still tag's corners over pictures."""
+    """Corners of a tag at rest scatter over pictures by the given noise."""
     for noise in (0.05, 0.3):
         pictures = camera(pixel_noise=noise).advance(0.0, 10.0, at(0.3, 0.2, -0.5))
         scatter = np.std([p.tags[0].corners for p in pictures], axis=0)
@@ -72,17 +72,17 @@ def test_pixel_noise_is_that_given():
 
 
 def test_tags_out_of_sight_are_not_reported():
-    """Both in the middle; none outside the picture, above the water, turned over or far away."""
+    """Both tags are seen in the middle; none outside the picture, above the water, upside down or far away."""
     assert set(seen(camera(), at(0.0, 0.0, -0.5))) == {(15, 16)}
     for pose in (at(3.5, 0.0, -0.5), at(0.0, 0.0, 0.3), at(0.0, 0.0, -0.5, roll=3.0), at(0.0, 0.0, -6.0)):
         assert set(seen(camera(), pose)) == {()}
     assert set(seen(camera(), at(0.0, 0.0, -0.5, roll=1.5))) == {()}
     at_the_edge = {seen(camera(), at(x, 0.0, -0.6))[0] for x in np.linspace(1.8, 2.4, 25)}
-    assert at_the_edge == {(15, 16), (16,), ()}  # the front tag goes first
+    assert at_the_edge == {(15, 16), (16,), ()}  # the front tag disappears first
 
 
 def test_wild_water_hides_tags():
-    """At a slope of 0.06 many tags are bent too much to be found, at 0.005 none."""
+    """At a slope of 0.06 many tags are too distorted to be found, at 0.005 none."""
     counts = [
         np.mean([len(tags) for tags in seen(camera(ripples=slope), at(0.2, 0.1, -0.8), 20.0)])
         for slope in (0.005, 0.06)
@@ -91,7 +91,7 @@ def test_wild_water_hides_tags():
 
 
 def test_mounts_are_where_they_truly_are():
-    """A tag that is mounted 10 mm further forward appears 10 mm further forward."""
+    """A tag mounted 10 mm further forward appears 10 mm further forward."""
     mount = FINSROV.tags.mounts[15]
     moved = {15: mount.model_copy(update={"position": mount.position + [0.01, 0.0, 0.0]})}
     a, b = (camera(pixel_noise=0.0, mounts=m).advance(0.0, 0.2, at(0.0, 0.0, -0.5))[0] for m in ({}, moved))
@@ -102,7 +102,7 @@ def test_mounts_are_where_they_truly_are():
 
 @pytest.mark.slow
 def test_exposure_blurs_drawn_pictures():
-    """Of a vehicle that moves 1 m/s, 30 ms of exposure leave less contrast than 1 ms; of one that stands, as much."""
+    """At 1 m/s an exposure of 30 ms leaves less contrast than 1 ms; at rest the contrast is equal."""
 
     def contrast(exposure, speed):
         eye = camera("pictures", exposure=exposure)
@@ -118,7 +118,8 @@ def test_exposure_blurs_drawn_pictures():
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", ["corners", "pictures"])
 def test_equal_seeds_give_equal_pictures_however_time_is_cut(mode):
-    """Two cameras of one seed see the same in ticks of different length; one of another seed does not."""
+    """Two cameras of one seed give the same pictures at different tick lengths; a camera of another seed does
+    not."""
 
     def run(tick, seed):
         eye, found = camera(mode, "realistic", seed), []
@@ -138,7 +139,7 @@ def test_equal_seeds_give_equal_pictures_however_time_is_cut(mode):
 
 
 def test_the_basin_is_in_the_picture():
-    """A shallower pool looks different around the vehicle."""
+    """A shallower pool changes the picture around the vehicle."""
     from finssim.pool.plant_spec import Basin
 
     true, _, settings = camera_of(FINSROV, 1, "nominal")
@@ -152,7 +153,7 @@ def test_the_basin_is_in_the_picture():
 
 
 def test_what_cannot_be_is_refused():
-    """No tags, no such mode: one sentence each."""
+    """A vehicle without tags and an unknown mode are each refused in one sentence."""
     true, _, settings = camera_of(FINSROV, 1, "nominal")
     with pytest.raises(PlantSpecError, match="has no tags"):
         PoolCamera(FINSROV.model_copy(update={"tags": None}), true, settings=settings)

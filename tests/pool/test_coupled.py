@@ -1,4 +1,4 @@
-"""Matrices that couple all axes and stay physical."""
+"""Matrices that couple all axes remain physical."""
 
 import numpy as np
 from hypothesis import given
@@ -27,7 +27,7 @@ def test_a_matrix_about_the_origin_in_body_axes_is_its_diagonal():
 
 
 def test_axes_shift_and_turn_a_twist():
-    """A pure yaw rate moves a point ahead of the origin sideways; axes turned by 90° see that as surge."""
+    """A pure yaw rate moves a point ahead of the origin sideways; in axes turned by 90° this is surge."""
     yaw = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 2.0])
     ahead = PrincipalAxes(center=(0.5, 0.0, 0.0), tilt_deg=(0.0, 0.0, 0.0)).to_axes() @ yaw
     np.testing.assert_allclose(ahead, [0.0, 1.0, 0.0, 0.0, 0.0, 2.0], atol=1e-12)

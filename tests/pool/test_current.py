@@ -1,4 +1,4 @@
-"""The pool's circulation obeys what water in a box must."""
+"""The pool's circulation satisfies the conditions of water in a box."""
 
 import numpy as np
 import warp as wp
@@ -22,7 +22,7 @@ def evaluate(water: CirculationData, place: wp.array(dtype=wp.vec3), t: float, o
 
 
 def at(places, t=0.0, water=CIRCULATION):
-    """Velocities at some places, (k, 3)."""
+    """Return velocities at some points, (k, 3)."""
     place = wp.array(np.asarray(places, dtype=np.float32).reshape(-1, 3), dtype=wp.vec3, device="cpu")
     out = wp.zeros_like(place)
     wp.launch(evaluate, dim=len(place), inputs=[water, place, t, out], device="cpu")
@@ -32,7 +32,7 @@ def at(places, t=0.0, water=CIRCULATION):
 @settings(max_examples=50)
 @given(s=st.floats(-1.0, 1.0), t=st.floats(0.0, 1000.0))
 def test_it_stands_still_at_all_four_walls(s, t):
-    """Both components: water neither passes a wall nor slides along it."""
+    """Both components are zero: water neither crosses a wall nor slides along it."""
     walls = [(2.0, s, -0.2), (-2.0, s, -0.2), (2.0 * s, 1.0, -0.2), (2.0 * s, -1.0, -0.2)]
     assert np.abs(at(walls, t)).max() < 1e-6
 
@@ -47,7 +47,8 @@ def test_no_water_appears_or_vanishes(x, y, t):
 
 
 def test_the_largest_speed_is_the_one_that_is_asked_for():
-    """One cell of 0.05 m/s at the surface reaches that somewhere and exceeds it nowhere; sense 1 is anticlockwise."""
+    """One cell of 0.05 m/s at the surface reaches this speed somewhere and never exceeds it; sense 1 is
+    anticlockwise."""
     alone = Eddy(cells=1, speed=0.05, unsteadiness=0.0, period=1.0, phase=0.0)
     water = circulation_data(Circulation(eddies=(alone,)), Basin())
     grid = [(x, y, 0.0) for x in np.linspace(-2, 2, 41) for y in np.linspace(-1, 1, 41)]
@@ -57,7 +58,7 @@ def test_the_largest_speed_is_the_one_that_is_asked_for():
 
 
 def test_it_is_slower_at_the_floor_and_changes_with_time():
-    """Half of the surface's speed at a floor share of 0.5."""
+    """At a floor share of 0.5 the speed at the floor is half of that at the surface."""
     floor, surface = at([(0.7, 0.4, -1.0), (0.7, 0.4, 0.0)])
     np.testing.assert_allclose(floor, 0.5 * surface, rtol=1e-5)
     assert np.abs(at([(0.7, 0.4, 0.0)], 30.0) - surface).max() > 1e-3

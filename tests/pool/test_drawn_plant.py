@@ -18,7 +18,7 @@ OPEN_WATER = {
 
 
 def distance(spec):
-    """How far a plant is from the vehicle file: relative changes of its largest groups of numbers."""
+    """Return a plant's distance from the vehicle file: relative changes of its largest groups of numbers."""
     M_A = spec.added_mass.about_origin() - FINSROV.added_mass_matrix()
     gains = [g - 1.0 for t in spec.thrusters.values() for g in (t.gain_plus, t.gain_minus)]
     offset = np.subtract(spec.body.center_of_gravity, FINSROV.body.center_of_gravity)
@@ -29,13 +29,13 @@ def distance(spec):
 
 
 def test_equal_seeds_give_equal_plants_and_others_do_not():
-    """A plant is its seed, its severity and its vehicle."""
+    """Seed, severity and vehicle determine a plant."""
     assert draw_plant(FINSROV, 7, "realistic") == draw_plant(FINSROV, 7, "realistic")
     assert draw_plant(FINSROV, 7, "realistic") != draw_plant(FINSROV, 8, "realistic")
 
 
 def test_the_nominal_plant_has_the_numbers_of_the_file():
-    """No added coupling, no loss, no current, no tether."""
+    """It has no added coupling, no loss, no current and no tether."""
     spec = draw_plant(FINSROV, 3, "nominal")
     assert np.all(distance(spec) == 0.0)
     assert np.allclose(spec.damping.linear, HYDRO.linear_damping)
@@ -51,7 +51,7 @@ def test_each_seed_is_harder_where_the_severity_is():
 
 
 def test_matrices_are_coupled_and_physical():
-    """Added mass is symmetric positive definite, with entries off the diagonal that the file does not have."""
+    """Added mass is symmetric positive definite, with off-diagonal entries that the file does not have."""
     for seed in range(10):
         M_A = draw_plant(FINSROV, seed, "hard").added_mass.about_origin()
         assert np.allclose(M_A, M_A.T) and np.linalg.eigvalsh(M_A)[0] > 0.0
@@ -60,7 +60,8 @@ def test_matrices_are_coupled_and_physical():
 
 
 def test_couplings_that_could_add_energy_are_made_smaller():
-    """A vehicle whose sideways drag rolls it: the plant is one that only loses energy; `Damping` checks it."""
+    """For a vehicle that rolls by its sideways drag, the drawn plant still only loses energy; `Damping`
+    checks this."""
     strong = load_vehicle("bluerov2").hydrodynamics["calibrated"].quadratic_damping.copy()
     strong[3, 1] = -strong[1, 1]
     vehicle = load_vehicle("bluerov2").replace(
@@ -72,7 +73,7 @@ def test_couplings_that_could_add_energy_are_made_smaller():
 
 
 def test_the_mean_plant_is_the_vehicle():
-    """Over seeds, added mass and thrust are the file's, to within what 40 draws of ±10 and ±15 % leave."""
+    """Over seeds, mean added mass and thrust are the file's, within the scatter of 40 draws of ±10 and ±15 %."""
     specs = [draw_plant(FINSROV, seed, "realistic") for seed in range(40)]
     M_A = np.mean([np.diag(s.added_mass.matrix) for s in specs], axis=0)
     assert np.allclose(M_A, np.diag(HYDRO.added_mass), rtol=3.0 * 0.1 / np.sqrt(3.0 * 40.0))
@@ -81,7 +82,7 @@ def test_the_mean_plant_is_the_vehicle():
 
 
 def steady_speed(spec, axis, wrench):
-    """Speed at which a plant settles when it can move along one axis only [m/s, rad/s]."""
+    """Return the steady speed of a plant that can move along one axis only [m/s, rad/s]."""
     plant = Plant(
         FINSROV, spec.model_copy(update=OPEN_WATER), start=((0.0, 0.0, -100.0), (0.0, 0.0, 0.0, 1.0))
     )
@@ -101,7 +102,7 @@ def steady_speed(spec, axis, wrench):
 
 
 def file_speed(axis, wrench):
-    """The same by the file: d1 v + d2 v² = wrench."""
+    """Return the same speed from the file: d1 v + d2 v² = wrench."""
     d1, d2 = HYDRO.linear_damping[axis, axis], HYDRO.quadratic_damping[axis, axis]
     return 2.0 * wrench / (d1 + np.sqrt(d1 * d1 + 4.0 * d2 * wrench))
 
@@ -120,7 +121,7 @@ def test_a_realistic_plant_is_still_as_fast_as_the_vehicle(axis):
 
 
 def test_a_vehicle_without_what_the_pool_needs_is_refused():
-    """The message says what is missing; so it does for an unknown severity."""
+    """The message names what is missing, or an unknown severity."""
     blind = FINSROV.model_copy(update={"sensors": FINSROV.sensors.model_copy(update={"imu": None})})
     with pytest.raises(PlantSpecError, match="has no sensors.imu"):
         draw_plant(blind, 0, "nominal")
@@ -132,7 +133,7 @@ def test_a_vehicle_without_what_the_pool_needs_is_refused():
 
 
 def test_a_plant_is_drawn_around_an_identified_file_too():
-    """What the file says is the middle of the draw, whoever wrote it."""
+    """Draws are centred on the values of the file, whatever its source."""
     heavier = FINSROV.replace({"body.mass": 13.0, "hydrodynamics.calibrated.linear_damping.0.0": 60.0})
     spec = draw_plant(heavier, 1, "nominal")
     assert spec.body.mass == 13.0 and spec.damping.linear[0][0] == 60.0

@@ -1,4 +1,4 @@
-"""Each fault does what it says to the frames, and nothing else."""
+"""Each fault affects the frames as described, and nothing else."""
 
 import math
 
@@ -19,7 +19,7 @@ def telemetry(i):
 
 
 def sequences(faults, n=400):
-    """Sequence numbers that arrive, in the order of their arrival."""
+    """Return the sequence numbers that arrive, in order of arrival."""
     decoder, arrivals = Decoder(), []
     for i in range(n):
         arrivals += faults.arrivals(0.01 * i, faults.encode(telemetry(i)))
@@ -29,7 +29,7 @@ def sequences(faults, n=400):
 
 
 def test_without_faults_every_frame_arrives_once_unchanged():
-    """Byte by byte."""
+    """Frames are identical byte by byte."""
     faults = Faults()
     assert faults.arrivals(1.0, faults.encode(ZERO)) == [(1.0, encode_telemetry(ZERO))]
     assert sequences(faults)[0] == list(range(400))
@@ -37,25 +37,25 @@ def test_without_faults_every_frame_arrives_once_unchanged():
 
 @pytest.mark.parametrize("probability", [0.0, 0.1, 0.5, 1.0])
 def test_frames_are_lost_with_the_chance_asked_for(probability):
-    """To three standard deviations of 400 draws."""
+    """The losses agree to three standard deviations of 400 draws."""
     lost = 1.0 - len(sequences(Faults(drop=probability))[0]) / 400.0
     assert abs(lost - probability) <= 3.0 * math.sqrt(probability * (1.0 - probability) / 400.0)
 
 
 def test_commands_are_lost_apart_from_telemetry():
-    """Each direction has its own chance."""
+    """Each direction has its own probability of loss."""
     faults = Faults(drop_commands=1.0)
     assert faults.lost(commands=True) and not faults.lost()
 
 
 def test_corrupt_frames_do_not_pass_the_decoder():
-    """All of them spoiled, none accepted with a wrong CRC."""
+    """All frames are corrupted, and none is accepted with a wrong CRC."""
     seen, decoder = sequences(Faults(corrupt=1.0))
     assert seen == [] and decoder.refused["bad_crc"] > 100
 
 
 def test_reordered_frames_are_overtaken_and_duplicates_come_twice():
-    """The same frames, in another order or twice."""
+    """The same frames arrive in another order or twice."""
     seen, _ = sequences(Faults(reorder=0.2))
     assert sorted(seen) == list(range(400)) and seen != sorted(seen)
     seen, _ = sequences(Faults(duplicate=1.0))
@@ -63,7 +63,7 @@ def test_reordered_frames_are_overtaken_and_duplicates_come_twice():
 
 
 def test_frozen_sensors_stand_while_the_controller_runs():
-    """Readings hold, sequence and clock go on; they move again when the fault is gone."""
+    """Readings are constant while sequence and clock advance; they change again once the fault ends."""
     faults, decoder = Faults(), Decoder()
     faults.freeze_sensors = True
     frames = [decoder.feed(faults.encode(telemetry(i)))[0] for i in (1, 2, 3)]
@@ -74,7 +74,7 @@ def test_frozen_sensors_stand_while_the_controller_runs():
 
 @pytest.mark.parametrize("name", [*NUMBERS, "gyro.2", "motor_rpm.7"])
 def test_a_field_can_be_nan_with_a_right_checksum(name):
-    """Exactly that field, at its place on the wire; the decoder sees a good CRC and refuses the number."""
+    """Exactly this field is NaN on the wire; the decoder finds the CRC valid and refuses the number."""
     faults, decoder = Faults(), Decoder()
     faults.nan_field = name
     frame = faults.encode(ZERO)
@@ -88,7 +88,7 @@ def test_a_field_can_be_nan_with_a_right_checksum(name):
 
 
 def test_what_is_no_fault_is_refused_when_it_is_set():
-    """Not when the next frame leaves."""
+    """An invalid fault is refused when it is set, not when the next frame is sent."""
     faults = Faults()
     for name, value in (("drop", 1.5), ("corrupt", -0.1), ("nan_field", "altitude"), ("nan_field", "gyro.3")):
         with pytest.raises(FaultError):
@@ -96,7 +96,7 @@ def test_what_is_no_fault_is_refused_when_it_is_set():
 
 
 def test_equal_seeds_lose_equal_frames():
-    """And other seeds others."""
+    """Other seeds lose other frames."""
     assert (
         sequences(Faults(3, drop=0.3))[0]
         == sequences(Faults(3, drop=0.3))[0]

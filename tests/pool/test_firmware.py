@@ -1,4 +1,4 @@
-"""The motor controller's program, with bytes in and bytes out."""
+"""The motor controller's firmware, tested through its input and output bytes."""
 
 import numpy as np
 import pytest
@@ -43,7 +43,7 @@ def telemetry(mcu, now, sample=REST):
 
 @pytest.mark.parametrize("name", FINSROV.thruster_names)
 def test_outputs_and_signs_are_those_of_the_vehicle_file(name):
-    """Half of full scale on a motor's output turns that thruster, in the direction its sign says."""
+    """Half of full scale on a motor's output turns its thruster in the direction of its sign."""
     mcu, thruster = firmware(), FINSROV.thrusters[name]
     mcu.receive(0.0, frame(only(thruster.motor_index, 0.5)))
     expected = np.zeros(8)
@@ -52,7 +52,7 @@ def test_outputs_and_signs_are_those_of_the_vehicle_file(name):
 
 
 def test_targets_below_the_slowest_speed_are_standstill():
-    """Half of it is nothing; the file's slowest speed itself turns."""
+    """Half of the file's slowest speed gives zero; the slowest speed itself turns the motor."""
     mcu, thruster = firmware(), FINSROV.thrusters["H_RF"]
     slowest = thruster.dead_rpm_plus / 3000.0
     mcu.receive(0.0, frame(only(thruster.motor_index, 0.5 * slowest)))
@@ -62,7 +62,7 @@ def test_targets_below_the_slowest_speed_are_standstill():
 
 
 def test_motors_stop_half_a_second_after_the_last_command():
-    """Not before, and a fresh command starts them again."""
+    """They do not stop earlier, and a new command starts them again."""
     mcu = firmware()
     mcu.receive(1.0, frame([0.5] * 8))
     mcu.watch(1.499)
@@ -75,7 +75,7 @@ def test_motors_stop_half_a_second_after_the_last_command():
 
 
 def test_a_disabled_command_stops_the_motors():
-    """Whatever its numbers are."""
+    """This holds for any numbers in the command."""
     mcu = firmware()
     mcu.receive(0.0, frame([0.5] * 8))
     mcu.receive(0.1, frame([0.5] * 8, enable=False))
@@ -83,7 +83,7 @@ def test_a_disabled_command_stops_the_motors():
 
 
 def test_bad_frames_neither_move_nor_feed_the_watchdog():
-    """A wrong CRC or a number beyond full scale changes nothing, and the timeout runs on."""
+    """A wrong CRC or a number beyond full scale changes nothing and does not restart the timeout."""
     mcu = firmware()
     mcu.receive(0.0, frame([0.5] * 8))
     good = frame([-0.5] * 8)
@@ -97,7 +97,7 @@ def test_bad_frames_neither_move_nor_feed_the_watchdog():
 
 
 def test_a_command_may_come_in_pieces():
-    """As over a serial line."""
+    """A command may be split, as over a serial line."""
     mcu, data = firmware(), frame([0.5] * 8)
     mcu.receive(0.0, data[:20])
     assert not mcu.target.any()
@@ -106,7 +106,8 @@ def test_a_command_may_come_in_pieces():
 
 
 def test_echoes_come_on_request_one_in_so_many():
-    """Mask bit 0 and a decimation of 3: one echo in three commands, with what was received and applied."""
+    """Mask bit 0 and a decimation of 3 give one echo per three commands, with the received and applied
+    values."""
     mcu = firmware()
     assert mcu.receive(0.0, frame([0.5] * 8)) == []
     mcu.receive(0.0, encode_debug_config(1, 1, 3))
@@ -122,7 +123,7 @@ def test_echoes_come_on_request_one_in_so_many():
 
 
 def test_echoes_say_why_a_command_was_refused():
-    """Disabled, after a timeout, after a bad frame."""
+    """The reasons are: disabled, after a timeout, after a bad frame."""
     mcu = firmware()
     mcu.receive(0.0, encode_debug_config(1, 1, 1))
 
@@ -138,7 +139,7 @@ def test_echoes_say_why_a_command_was_refused():
 
 
 def test_status_flags_tell_what_it_does():
-    """Count of commands, echo, drive and targets."""
+    """The flags contain the count of commands, echo, drive and targets."""
     mcu = firmware()
     before = telemetry(mcu, 0.01).flags
     assert before & StatusFlag.DIAGNOSTICS and before & StatusFlag.RPM_CONTROL
@@ -153,13 +154,14 @@ def test_status_flags_tell_what_it_does():
 
 
 def test_its_clock_drifts_and_wraps():
-    """100 ppm is 0.1 s in a thousand; 2³² ms come round to 0."""
+    """100 ppm is 0.1 s in a thousand; 2³² ms wrap to 0."""
     assert firmware(crystal_ppm=100.0).clock(1000.0) == 1000100
     assert firmware(clock_start=2**32 - 500).clock(1.0) == 500
 
 
 def test_a_reboot_is_silent_and_forgets_everything():
-    """Motors off at once, 1.5 s of silence and deafness, then clock, counters and sequence from the start."""
+    """Motors stop at once; after 1.5 s without sending or receiving, clock, counters and sequence start
+    again."""
     mcu = firmware(clock_start=100000)
     mcu.receive(0.0, frame([0.5] * 8))
     for i in range(5):
@@ -173,7 +175,7 @@ def test_a_reboot_is_silent_and_forgets_everything():
 
 
 def test_telemetry_has_speeds_by_output_with_the_motors_signs():
-    """The inverse of what a command does."""
+    """Telemetry inverts the mapping of commands."""
     mcu = firmware()
     speed = np.arange(1.0, 9.0)
     rpm = mcu.telemetry(0.01, REST, speed, np.zeros(8)).motor_rpm

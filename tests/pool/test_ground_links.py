@@ -1,4 +1,4 @@
-"""The router between an autopilot and its ground stations, by real sockets on this machine."""
+"""The router between an autopilot and its ground stations, over real sockets on this machine."""
 
 import json
 import socket
@@ -36,7 +36,7 @@ def beat(sequence=0):
 
 
 def test_frames_are_cut_off_a_stream_as_they_complete():
-    """In any pieces, behind anything that is no frame."""
+    """Frames are found in any pieces, and after bytes that are not a frame."""
     stream, frames = bytearray(), []
     for byte in b"hello" + beat(1) + beat(2) + b"\x00" + beat(3):
         stream.append(byte)
@@ -57,7 +57,8 @@ def test_the_page_of_the_log_is_served_with_it_and_ends_with_it():
 
 
 def test_stations_hear_the_vehicle_and_each_other(links):
-    """Over TCP and UDP; a station does not hear itself; half a frame of one does not spoil that of another."""
+    """Over TCP and UDP, a station does not receive its own frames; half a frame from one does not corrupt
+    another's."""
     one, other = (socket.create_connection(links.tcp, timeout=5.0) for _ in range(2))
     caller = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     caller.settimeout(5.0)
@@ -83,7 +84,7 @@ def test_stations_hear_the_vehicle_and_each_other(links):
 
 
 def test_a_station_is_sent_to_before_it_has_spoken_and_a_taken_port_is_refused():
-    """As a vehicle sends to 14550; every end that was open is closed again."""
+    """The first is what a vehicle does with 14550; on refusal every opened socket is closed again."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as station:
         station.bind(FREE)
         station.settimeout(5.0)
@@ -97,7 +98,8 @@ def test_a_station_is_sent_to_before_it_has_spoken_and_a_taken_port_is_refused()
 
 @pytest.mark.slow
 def test_pymavlink_drives_it_in_real_time_and_its_log_reports(links):
-    """Heartbeat, arming, an axis that moves the truth, lines of the Doppler log, and disarming, over real sockets."""
+    """Heartbeat, arming, an axis that moves the vehicle, lines of the Doppler log, and disarming, over real
+    sockets."""
     heavy = with_navigation(load_vehicle("bluerov2_heavy"))
     world = VirtualPool(heavy, draw_plant(heavy, 1, "nominal"), firmware="ardusub")
     stop = threading.Event()

@@ -1,4 +1,4 @@
-"""Thrust lost to the hull, to motion and to neighbours."""
+"""Thrust is lost to the hull, to motion and to neighbours."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ NOMINAL = draw_plant(FINSROV, 0, "nominal").model_copy(
 
 
 def thrust(propellers, speed, surge=0.0, names=("H_LF",)):
-    """Thrust of one thruster at a shaft speed while the vehicle moves [N]."""
+    """Return the thrust of one thruster at a shaft speed while the vehicle moves [N]."""
     plant = Plant(
         FINSROV,
         NOMINAL.model_copy(update={"propellers": propellers}),
@@ -31,13 +31,14 @@ def thrust(propellers, speed, surge=0.0, names=("H_LF",)):
 
 
 def test_at_rest_and_alone_it_is_the_bollard_thrust():
-    """T = c ω² of the file."""
+    """The thrust is T = c ω² of the file."""
     T, omega = thrust(Propellers(), 150.0)
     assert T == pytest.approx(FINSROV.thrusters["H_LF"].thrust(omega), rel=1e-4)
 
 
 def test_moving_along_the_thrust_costs_the_part_that_advance_says():
-    """T = T_bollard (1 - V / (J0 n D)) with V the speed along the axis; against it thrust grows."""
+    """T = T_bollard (1 - V / (J0 n D)) with V the speed along the axis; for motion against the thrust it
+    grows."""
     p = Propellers(own_share=1.0)
     T, omega = thrust(p, 150.0, surge=0.3)
     V = 0.3 * FINSROV.thrusters["H_LF"].axis[0]
@@ -47,7 +48,7 @@ def test_moving_along_the_thrust_costs_the_part_that_advance_says():
 
 
 def test_a_neighbour_takes_thrust_and_a_far_one_less():
-    """The matrix of shares falls with distance and has no share of a propeller in itself."""
+    """The matrix of loss shares falls with distance and has a zero diagonal."""
     p = Propellers(induced_share=0.2)
     alone = thrust(p, 150.0)[0]
     assert thrust(p, 150.0, names=("H_LF", "V_LF"))[0] < thrust(p, 150.0, names=("H_LF", "H_RB"))[0] < alone
@@ -56,7 +57,7 @@ def test_a_neighbour_takes_thrust_and_a_far_one_less():
 
 
 def test_the_deduction_and_the_gain_scale_the_thrust():
-    """As built, less what the jet takes back from the hull."""
+    """The thrust is as built, less the part that the jet takes back from the hull."""
     built = NOMINAL.thrusters["H_LF"].model_copy(update={"gain_plus": 1.2, "deduction": 0.1})
     spec = NOMINAL.model_copy(update={"thrusters": {**NOMINAL.thrusters, "H_LF": built}})
     plant = Plant(FINSROV, spec, start=((0.0, 0.0, -25.0), LEVEL))

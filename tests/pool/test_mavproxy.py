@@ -1,4 +1,4 @@
-"""A real MAVProxy, as a process of its own, against `finssim pool --firmware ardusub`."""
+"""A real MAVProxy process against `finssim pool --firmware ardusub`."""
 
 import importlib.util
 import os
@@ -17,7 +17,7 @@ NEEDED = [name for name in ("MAVProxy", "pymavlink") if importlib.util.find_spec
 
 
 class Program:
-    """A process, and what it has printed so far."""
+    """A process and its output so far."""
 
     def __init__(self, *words, **environment):
         self.process = subprocess.Popen(
@@ -36,7 +36,7 @@ class Program:
             self.output += data.decode(errors="replace")
 
     def until(self, pattern, seconds=60.0):
-        """The match of a pattern in what it prints."""
+        """Return the match of a pattern in its output."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             if match := re.search(pattern, self.output):
@@ -45,7 +45,7 @@ class Program:
         raise AssertionError(f"no {pattern!r} in:\n{self.output}")
 
     def type(self, line, pattern=None):
-        """Type a line, and wait for a pattern in what follows."""
+        """Type a line, and wait for a pattern in the output that follows."""
         self.output = ""
         self.process.stdin.write(f"{line}\n".encode())
         self.process.stdin.flush()
@@ -70,7 +70,8 @@ class Program:
 @pytest.mark.slow
 @pytest.mark.skipif(bool(NEEDED), reason=f"not installed: {', '.join(NEEDED)} (make installs them)")
 def test_mavproxy_connects_arms_drives_and_disarms(tmp_path):
-    """It fetches all parameters, changes mode, arms, drives ahead by its rc module, and disarms; the truth tells."""
+    """It fetches all parameters, changes mode, arms, drives ahead by its rc module, and disarms; the truth
+    file confirms it."""
     truth = tmp_path / "truth.fst"
     pool = ["--firmware", "ardusub", "--vehicle", "bluerov2_heavy", "--severity", "nominal", "--port", 0]
     pool += ["--tcp", "127.0.0.1:0", "--dvl", "127.0.0.1:0", "--ground", "none", "--truth", truth]

@@ -1,4 +1,4 @@
-"""Motors behind their speed loop: lag, delay, dead zone, limits, and a loop that finds its speed on any battery."""
+"""Motors with their speed loop: lag, delay, dead zone, limits, and control of speed at any battery voltage."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ NOMINAL = draw_plant(FINSROV, 0, "nominal")
 
 
 def speeds(spec, target_rpm, duration=2.0, motor=4, seed=0, **options):
-    """True shaft speed of one motor after a step of its target [rpm], by physics step."""
+    """Return the true shaft speed of one motor after a step of its target [rpm], by physics step."""
     plant = Plant(FINSROV, spec, seed=seed, **options)
     plant.target[motor] = target_rpm * RPM
     out = []
@@ -24,7 +24,7 @@ def speeds(spec, target_rpm, duration=2.0, motor=4, seed=0, **options):
 
 @pytest.mark.parametrize("target", [1500.0, -900.0])
 def test_the_loop_settles_on_its_target(target):
-    """Within a quantum of the speed measurement, on a hard plant with a sagging battery too."""
+    """The error is within a quantum of the speed measurement, also on a hard plant with a sagging battery."""
     for spec in (NOMINAL, draw_plant(FINSROV, 3, "hard")):
         settled = speeds(spec, target, 4.0)[-200:]
         assert abs(settled.mean() - target) < spec.firmware.rpm_quantum
@@ -32,7 +32,8 @@ def test_the_loop_settles_on_its_target(target):
 
 
 def test_the_shaft_follows_after_the_delay_with_the_file_lag():
-    """Nothing for the delay; 63 % of the way after delay plus time constant, a little sooner for the loop's push."""
+    """There is no motion during the delay; 63 % is reached slightly before delay plus time constant, owing to
+    the loop."""
     thruster = FINSROV.thrusters["H_LF"]
     response = speeds(NOMINAL, 1000.0) / 1000.0
     step = 0.005
@@ -45,7 +46,7 @@ def test_the_shaft_follows_after_the_delay_with_the_file_lag():
 
 
 def test_without_the_loop_the_feed_forward_alone_is_wrong():
-    """Gains of zero leave the error of the firmware's belief: what full throttle gives is not what the file says."""
+    """With zero gains the firmware's model error remains: full throttle does not give the speed of the file."""
     off = NOMINAL.firmware.model_copy(update={"gain": 0.0, "integral_gain": 0.0, "derivative_gain": 0.0})
     spec = NOMINAL.model_copy(update={"firmware": off})
     assert abs(speeds(spec, 1000.0)[-1] - 1000.0) > 30.0
@@ -57,7 +58,8 @@ def test_without_the_loop_the_feed_forward_alone_is_wrong():
 
 @pytest.mark.parametrize("target", [1500.0, -900.0])
 def test_pulses_alone_turn_a_motor_as_fast_as_it_and_its_battery_can(target):
-    """Without a speed loop: the target at full voltage and for a motor as described, else in proportion to both."""
+    """Without a speed loop a nominal motor at full voltage reaches the target; otherwise speed scales with
+    both."""
     assert speeds(NOMINAL, target, speed_loop=False)[-1] == pytest.approx(target, rel=2e-3)
     built = NOMINAL.thrusters
     weak = {name: t.model_copy(update={"full_rpm": 0.9 * t.full_rpm}) for name, t in built.items()}
@@ -69,14 +71,14 @@ def test_pulses_alone_turn_a_motor_as_fast_as_it_and_its_battery_can(target):
 
 
 def test_the_derivative_gain_holds_the_rise_back():
-    """More of it, less speed on the way."""
+    """A larger derivative gain gives less speed during the rise."""
     strong = NOMINAL.firmware.model_copy(update={"derivative_gain": 0.03})
     held = speeds(NOMINAL.model_copy(update={"firmware": strong}), 1500.0, 0.3)
     assert held[20:50].mean() < speeds(NOMINAL, 1500.0, 0.3)[20:50].mean() - 10.0
 
 
 def test_no_shaft_turns_slower_than_its_slowest_speed():
-    """A throttle for less than that does not turn it; one for more does."""
+    """A throttle for a lower speed does not turn it; one for a higher speed does."""
     off = NOMINAL.firmware.model_copy(update={"gain": 0.0, "integral_gain": 0.0})
     spec = NOMINAL.model_copy(update={"firmware": off})
     slowest = NOMINAL.thrusters["H_LF"].dead_rpm_plus
@@ -85,12 +87,12 @@ def test_no_shaft_turns_slower_than_its_slowest_speed():
 
 
 def test_no_shaft_turns_faster_than_the_battery_allows():
-    """The file's firmware scale of 3000 rpm is beyond what any motor reaches."""
+    """The file's firmware scale of 3000 rpm exceeds what any motor reaches."""
     assert speeds(NOMINAL, 3000.0)[-1] == pytest.approx(NOMINAL.thrusters["H_LF"].full_rpm, rel=1e-3)
 
 
 def test_a_shaft_told_to_stop_stops():
-    """And stays stopped: no creeping from noise."""
+    """The shaft stays stopped: noise does not make it creep."""
     plant = Plant(FINSROV, NOMINAL)
     plant.target[0] = 150.0
     plant.advance(200)
@@ -100,7 +102,7 @@ def test_a_shaft_told_to_stop_stops():
 
 
 def test_speed_measurements_are_noisy_by_the_seed():
-    """Equal seeds repeat, other seeds do not; the noise has the size that the plant says."""
+    """Equal seeds repeat, other seeds do not; the noise has the plant's size."""
     assert np.array_equal(speeds(NOMINAL, 800.0, seed=3), speeds(NOMINAL, 800.0, seed=3))
     assert not np.array_equal(speeds(NOMINAL, 800.0, seed=3), speeds(NOMINAL, 800.0, seed=4))
     plant = Plant(FINSROV, NOMINAL)

@@ -1,4 +1,4 @@
-"""The plant's motion: the engine's where nothing is hidden, and physical where everything is."""
+"""The plant moves as the engine does if nothing is hidden, and physically if everything is."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ QUIET = {"circulation": Circulation(), "tether": None, "buoyancy": BuoyancyDrift
 
 
 def test_the_nominal_plant_moves_as_the_engine_does():
-    """Driven with the thrusts that its motors deliver, the calibrated simulation follows it for five seconds."""
+    """The calibrated simulation, driven with the thrusts of the plant's motors, follows it for five seconds."""
     spec = draw_plant(FINSROV, 0, "nominal")
     plant = Plant(FINSROV, spec)
     engine = Simulator(FINSROV, control_step=plant.step, substeps=1, pool=RectangularPool(), max_delay=0.1)
@@ -32,14 +32,15 @@ def test_the_nominal_plant_moves_as_the_engine_does():
         engine.set_thrust(plant.thrust)
         engine.step()
     assert np.linalg.norm(plant.position[:2]) > 0.2
-    # float32, and two orders of the same sums, over a thousand steps
+    # float32 and two orders of summation, over a thousand steps
     np.testing.assert_allclose(plant.position, engine.numpy("position")[0, 0], atol=2e-3)
     np.testing.assert_allclose(plant.nu, engine.numpy("velocity")[0, 0], atol=2e-3)
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_without_thrust_a_moving_plant_only_slows_down(seed):
-    """Coupled damping and panels take energy out at every step; what trim and buoyancy add is left out by balance."""
+    """Coupled damping and panels remove energy at every step; the balance excludes the work of trim and
+    buoyancy."""
     spec = draw_plant(FINSROV, seed, "hard")
     body = spec.body.model_copy(update={"displaced_volume": spec.body.mass / FINSROV.water.density,
                                         "center_of_buoyancy": spec.body.center_of_gravity})  # fmt: skip
@@ -60,7 +61,7 @@ def test_without_thrust_a_moving_plant_only_slows_down(seed):
 
 
 def test_a_plant_lies_where_its_hidden_trim_puts_it():
-    """At rest it hangs with its centre of gravity below its centre of buoyancy, not level."""
+    """At rest its centre of gravity hangs below its centre of buoyancy, and it is not level."""
     spec = draw_plant(FINSROV, 2, "hard").model_copy(update=QUIET)
     plant = Plant(FINSROV, spec)
     plant.advance(2000)
@@ -70,10 +71,10 @@ def test_a_plant_lies_where_its_hidden_trim_puts_it():
 
 
 def test_it_drifts_with_the_circulation():
-    """A vehicle that does nothing is carried along; in still water it stays."""
+    """A passive vehicle is carried along by the circulation; in still water it stays."""
     spec = draw_plant(FINSROV, 1, "realistic")
     spec = spec.model_copy(update={"tether": spec.tether.model_copy(update={"length": 50.0})})
-    # Eddies without speed: the same kernel, so nothing is compiled for this test alone.
+    # Eddies without speed use the same kernel, so nothing is compiled for this test alone.
     calm = Circulation(eddies=[eddy.model_copy(update={"speed": 0.0}) for eddy in spec.circulation.eddies])
     carried = Plant(FINSROV, spec, start=((0.6, 0.3, -0.5), LEVEL))
     still = Plant(FINSROV, spec.model_copy(update={"circulation": calm}), start=((0.6, 0.3, -0.5), LEVEL))
@@ -84,7 +85,7 @@ def test_it_drifts_with_the_circulation():
 
 
 def test_it_stays_inside_the_walls():
-    """Full surge into the wall: the envelope ends there, to within the wall's give."""
+    """With full surge into the wall the envelope ends at the wall, to within its compliance."""
     spec = draw_plant(FINSROV, 1, "hard")
     plant = Plant(FINSROV, spec)
     share = np.linalg.pinv(FINSROV.control_matrix) @ (15.0 * np.eye(6)[0])
@@ -111,7 +112,7 @@ def test_buoyancy_drifts_by_grams():
 
 
 def test_a_battery_that_sags_gives_less_speed_at_full_throttle():
-    """The same full command turns the shafts slower by the part of the voltage that is missing."""
+    """At full command the shafts turn slower in proportion to the loss of voltage."""
     spec = draw_plant(FINSROV, 0, "nominal")
     speeds = []
     for battery in (Battery(), Battery(fade=0.2, fade_time=0.1)):

@@ -1,4 +1,4 @@
-"""A plant's file is the plant, and a file that is not physical is refused in one sentence."""
+"""A plant's file determines the plant, and an unphysical file is refused in one sentence."""
 
 import pytest
 import yaml
@@ -11,13 +11,13 @@ SPEC = draw_plant(FINSROV, 5, "hard")
 
 
 def test_a_file_read_again_is_the_same_plant(tmp_path):
-    """Every number survives, exactly."""
+    """Every number survives exactly."""
     SPEC.write(tmp_path / "plant.yaml")
     assert load_plant_spec(tmp_path / "plant.yaml") == SPEC
 
 
 def changed(tmp_path, path, value):
-    """A plant file with one value changed."""
+    """Return a plant file with one value changed."""
     data = SPEC.model_dump(mode="json")
     section = data
     *way, last = path

@@ -1,4 +1,4 @@
-"""Where points appear through ripples, against Snell's law and against what the detector finds in rendered pictures."""
+"""Apparent positions of points through ripples, against Snell's law and the detector on rendered pictures."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ POINTS = np.stack(
 
 
 def landing(view, pixels, ripples, z, time):
-    """Where the ray of each pixel comes down at heights z, traced through the waves one Snell's law at a time."""
+    """Return where each pixel's ray reaches heights z, traced through the waves by Snell's law."""
     waves = waves_of(ripples)
     rays, _ = CAMERA.lens.rays(pixels)
     found = []
@@ -36,7 +36,7 @@ def landing(view, pixels, ripples, z, time):
 
 
 def test_still_water_is_that_of_the_optics():
-    """Without ripples the pixels are those of `core.optics.project`, to 1e-4 px."""
+    """Without ripples the pixels equal those of `core.optics.project`, to 1e-4 px."""
     pixels, ok = RippledView(CAMERA, WATER).pixels(POINTS, 0.0)
     assert ok.all()
     assert np.abs(pixels - project(CAMERA, WATER, POINTS).pixels).max() < 1e-4
@@ -44,7 +44,8 @@ def test_still_water_is_that_of_the_optics():
 
 @pytest.mark.parametrize(("slope", "most"), [(0.003, 1e-5), (0.01, 1e-4)])
 def test_a_ray_through_ripples_ends_at_its_point(slope, most):
-    """A pixel's ray, traced forward through the waves, meets the point that it was computed for: 1 mm is 0.3 px."""
+    """A pixel's ray, traced forward through the waves, meets the point that the pixel was computed for: 1 mm
+    is 0.3 px."""
     ripples = Ripples(rms_slope=slope, seed=4)
     view = RippledView(CAMERA, WATER, ripples)
     pixels, ok = view.pixels(POINTS, 1.7)
@@ -54,7 +55,7 @@ def test_a_ray_through_ripples_ends_at_its_point(slope, most):
 
 
 def test_ripples_move_with_time_and_vanish_with_their_slope():
-    """Pixels change from moment to moment, and none by more than a hundredth when the slope is a thousandth."""
+    """Pixels vary with time, and by less than a hundredth when the slope is a thousandth."""
     still = RippledView(CAMERA, WATER).pixels(POINTS, 0.0)[0]
     view = RippledView(CAMERA, WATER, Ripples(rms_slope=0.01, seed=4))
     assert np.abs(view.pixels(POINTS, 0.0)[0] - view.pixels(POINTS, 0.2)[0]).std() > 0.1

@@ -1,4 +1,4 @@
-"""The virtual pool as a process of its own: real time over UDP and shared memory, lock-step over TCP."""
+"""The virtual pool as a separate process: real time over UDP and shared memory, lock-step over TCP."""
 
 import os
 import signal
@@ -50,7 +50,7 @@ def ports():
 
 
 class Process:
-    """`finssim pool` with some options, and what it has printed."""
+    """A `finssim pool` process with some options, and its output."""
 
     def __init__(self, *words):
         self.port, self.robot = ports()
@@ -76,7 +76,7 @@ class Process:
         self.lines = []
 
     def until(self, beginning):
-        """Read up to a line that begins so."""
+        """Read up to a line with this beginning."""
         for line in self.process.stdout:
             self.lines.append(line.strip())
             if line.startswith(beginning):
@@ -84,7 +84,7 @@ class Process:
         raise AssertionError(f"no line {beginning!r} in {self.lines}")
 
     def end(self, number=None):
-        """The exit status, after a signal if one is given."""
+        """Return the exit status, after a signal if one is given."""
         if number is not None:
             self.process.send_signal(number)
         self.lines += [line.strip() for line in self.process.stdout]
@@ -101,7 +101,7 @@ class Process:
 
 
 class Clock:
-    """Time that goes on only when somebody waits, or as a test says."""
+    """A clock that advances only when something waits or when a test sets it."""
 
     def __init__(self):
         self.now = 100.0
@@ -114,23 +114,23 @@ class Clock:
 
 
 def world(**options):
-    """A nominal pool."""
+    """Return a nominal pool."""
     return VirtualPool(FINSROV, draw_plant(FINSROV, 1, "nominal"), **options)
 
 
 def alone(**options):
-    """It, as all that is in the water."""
+    """Return a nominal pool with nothing else in the water."""
     return Fleet({"it": world(**options)})
 
 
 def telemetry(datagrams):
-    """Telemetry frames among what came."""
+    """Return the telemetry frames among some datagrams."""
     decoder = Decoder()
     return [m for data in datagrams for m in decoder.feed(data) if isinstance(m, Telemetry)]
 
 
 def test_a_pool_keeps_real_time():
-    """Two seconds of the clock are two seconds of the pool, with 100 telemetry frames a second."""
+    """Two seconds of the clock are two seconds in the pool, with 100 telemetry frames a second."""
     clock, (pool, robot) = Clock(), memory_pair()
     pace = serve_realtime(alone(), SiteWires({"it": pool}), duration=2.0, clock=clock, wait=clock.wait)
     assert clock.now == pytest.approx(102.0, abs=0.01) and pace.duration == 2.0 and pace.given_up == 0.0
@@ -138,7 +138,7 @@ def test_a_pool_keeps_real_time():
 
 
 def test_a_pool_that_was_stopped_does_not_catch_up():
-    """After a pause of 5 s the pool goes on where it was, and says so."""
+    """After a pause of 5 s the pool continues from where it stopped, and reports it."""
     clock, (pool, robot) = Clock(), memory_pair()
     paused = []
 
@@ -156,7 +156,7 @@ def test_a_pool_that_was_stopped_does_not_catch_up():
 
 
 def test_pictures_carry_the_time_of_the_machine():
-    """The sink is given arrival on this machine's clock, no later than now."""
+    """The sink receives the arrival time on this machine's clock, no later than now."""
     plan = make_plan("finsrov", "1", "nominal", camera="corners")
 
     class Sink:
@@ -175,7 +175,7 @@ def test_pictures_carry_the_time_of_the_machine():
 
 
 def test_lockstep_gives_what_the_pool_gives():
-    """Over TCP a robot gets bit for bit what a pool in its own process would have given."""
+    """Over TCP a robot receives bit for bit what a pool in its own process would give."""
     import threading
 
     plan = make_plan("finsrov", "2", "realistic", camera="corners")
@@ -200,7 +200,7 @@ def test_lockstep_gives_what_the_pool_gives():
 
 
 def test_lockstep_lets_in_one_robot_alone_and_outlives_no_garbage():
-    """A second robot finds nobody; one that speaks something else is told so, and the server ends."""
+    """A second robot cannot connect; a peer with another protocol receives an error, and the server ends."""
     server, pool, ended = LockstepServer((HERE, 0)), world(), []
     thread = threading.Thread(target=lambda: ended.append(server.serve(pool)), daemon=True)
     thread.start()
@@ -216,7 +216,7 @@ def test_lockstep_lets_in_one_robot_alone_and_outlives_no_garbage():
 
 
 def test_a_plan_follows_its_file_and_its_options(tmp_path):
-    """A plant file brings its own severity, seed and basin; cameras are as asked."""
+    """A plant file provides its severity, seed and basin; the cameras are as requested."""
     spec = draw_plant(FINSROV, 7, "hard")
     spec.write(tmp_path / "plant.yaml")
     plan = make_plan("finsrov", str(tmp_path / "plant.yaml"), "nominal", camera="corners")
@@ -230,7 +230,7 @@ def test_a_plan_follows_its_file_and_its_options(tmp_path):
 
 @pytest.mark.slow
 def test_the_command_in_lockstep(tmp_path):
-    """A subprocess is exchanged with, starts where it was told, and leaves pool file and truth."""
+    """A subprocess exchanges messages, starts at the given pose, and writes pool file and truth."""
     pool_file, truth = tmp_path / "pool.yaml", tmp_path / "truth.fst"
     words = ["--lockstep", "--camera", "corners", "--severity", "nominal", "--start", "0.3,-0.2,-0.6,90"]
     with Process(*words, "--pool-file", pool_file, "--truth", truth, "--duration", 1.0) as pool:
@@ -254,13 +254,13 @@ def test_the_command_in_lockstep(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
 def test_a_signal_ends_lockstep_in_order(number):
-    """Ctrl-C too where a script that started it in the background had it ignored."""
+    """Ctrl-C works too, even if a script started the process in the background with SIGINT ignored."""
     before = signal.signal(signal.SIGINT, signal.SIG_IGN), signal.signal(signal.SIGHUP, signal.SIG_DFL)
     try:
         pool = Process("--lockstep", "--camera", "none")
     finally:
         signal.signal(signal.SIGINT, before[0])
-        signal.signal(signal.SIGHUP, before[1])  # ignored where the tests run under nohup
+        signal.signal(signal.SIGHUP, before[1])  # ignored if the tests run under nohup
     with pool:
         pool.until("lock-step")
         assert pool.end(number) == 0
@@ -294,7 +294,7 @@ def test_the_command_in_real_time(tmp_path, slow_clock):
 
 @pytest.mark.slow
 def test_the_command_draws_pictures():
-    """A subprocess's drawn pictures arrive with tags that the detector finds, while telemetry goes on."""
+    """The detector finds the tags in a subprocess's drawn pictures, while telemetry continues."""
     from finssim.localization.detection.detector import detector
 
     with Process("--camera", "pictures", "--severity", "nominal", "--duration", "60") as pool:
@@ -329,7 +329,7 @@ def test_the_command_draws_pictures():
     ],
 )
 def test_the_command_refuses_in_one_sentence(capsys, tmp_path, monkeypatch, words, sentence):
-    """A wrong option ends it with status 2 and a line that names it."""
+    """A wrong option ends the command with status 2 and a line that names it."""
     from finssim.cli import boundary
     from finssim.cli.commands import app
 
@@ -339,7 +339,7 @@ def test_the_command_refuses_in_one_sentence(capsys, tmp_path, monkeypatch, word
 
 
 def test_a_pool_that_finds_its_port_taken_leaves_the_files_of_the_other_alone(tmp_path, capsys):
-    """Pool file and truth are written only when every wire is open."""
+    """Pool file and truth are written only after every wire is open."""
     from finssim.cli import boundary
     from finssim.cli.commands import app
 
@@ -356,7 +356,8 @@ def test_a_pool_that_finds_its_port_taken_leaves_the_files_of_the_other_alone(tm
 
 
 def test_guests_that_are_no_robot_do_not_end_lockstep():
-    """One connects and leaves, one sends garbage and breaks off, one asks for a page, ten are silent: then a robot."""
+    """One connects and leaves, one sends garbage and disconnects, one requests a page, ten are silent; then a
+    robot connects."""
     server, ended = LockstepServer((HERE, 0)), []
     thread = threading.Thread(target=lambda: ended.append(server.serve(world())), daemon=True)
     thread.start()
@@ -379,7 +380,7 @@ def test_guests_that_are_no_robot_do_not_end_lockstep():
 
 
 def test_a_port_that_is_taken_is_named():
-    """Neither real time nor lock-step takes another's port."""
+    """Neither real time nor lock-step takes a port that is in use."""
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as other:
         other.bind((HERE, 0))
         other.listen()

@@ -1,4 +1,4 @@
-"""The virtual pool's camera: what it sees, and how wrong its calibration is."""
+"""The virtual pool's camera: its field of view, and the errors of its calibration."""
 
 from dataclasses import fields
 
@@ -16,13 +16,14 @@ SEEDS = range(200)
 
 
 def turn(a, b):
-    """Angle between two orientations [rad]."""
+    """Return the angle between two orientations [rad]."""
     return 2.0 * np.arccos(np.clip(abs(np.dot(a, b)), 0.0, 1.0))
 
 
 @pytest.mark.parametrize("scale", [1.0, 1.5])
 def test_the_whole_pool_is_seen_from_half_a_metre_down(scale):
-    """Tags of a vehicle half a metre down, 0.1 m above its middle, are in the picture to the walls of the pool."""
+    """The tags of a vehicle half a metre down, 0.1 m above its middle, are in view as far as the walls of the
+    pool."""
     basin = Basin(length=4.0 * scale, width=2.0 * scale)
     site = true_site(basin)
     x, y = np.meshgrid(np.linspace(-0.5, 0.5, 41) * basin.length, np.linspace(-0.5, 0.5, 21) * basin.width)
@@ -31,7 +32,7 @@ def test_the_whole_pool_is_seen_from_half_a_metre_down(scale):
 
 
 def test_tags_off_the_walls_are_seen_from_little_depth():
-    """What keeps 0.23 m off the ends and 0.13 m off the sides is seen from 0.1 m under the surface."""
+    """Tags at least 0.23 m off the ends and 0.13 m off the sides are seen from 0.1 m under the surface."""
     site = true_site()
     x, y = np.meshgrid([-1.77, 1.77], [-0.87, 0.87])
     for depth in (0.1, 0.3, 0.7):
@@ -40,14 +41,14 @@ def test_tags_off_the_walls_are_seen_from_little_depth():
 
 
 def test_the_world_lies_on_the_water_above_the_middle():
-    """World origin: middle of the pool, on the still surface; the pool frame's is on the floor."""
+    """The world's origin is in the middle of the pool on the still surface; the pool frame's is on the floor."""
     assert np.allclose(
         true_site(Basin(depth=1.3)).T_pw, np.array(np.eye(4) + 1.3 * np.eye(4, k=1) * [[0], [0], [1], [0]])
     )
 
 
 def test_a_nominal_camera_is_known():
-    """Severity nominal: the calibration is the truth, the tags sit where the file says, the water is flat."""
+    """Severity nominal: the calibration is the truth, the tags are where the file says, the water is flat."""
     true, calibrated, settings = camera_of(FINSROV, 3, "nominal")
     assert true.sha256 == calibrated.sha256
     assert settings.ripples == settings.jitter == settings.dropout == 0.0
@@ -78,7 +79,7 @@ def test_calibration_errors_have_the_size_that_they_are_said_to_have(severity, f
 
 
 def test_equal_seeds_give_equal_cameras_and_other_seeds_others(tmp_path):
-    """The same seed twice, another once; and the calibrated pool survives its file."""
+    """The same seed repeats and another differs; the calibrated pool survives its file."""
     (a, b, s), (c, d, r), (_, other, _) = (camera_of(FINSROV, seed) for seed in (5, 5, 6))
     assert a.sha256 == c.sha256 and b.sha256 == d.sha256 != other.sha256
     assert all(np.array_equal(s.mounts[k].position, r.mounts[k].position) for k in s.mounts)

@@ -26,7 +26,7 @@ def still(time):
 
 
 def test_open_water_has_no_walls_in_reach_but_a_stream_waves_and_a_vehicle_that_navigates():
-    """The body stays the one that was drawn for the pool, and the plant's file holds all of it."""
+    """The body is the one drawn for the pool, and the plant's file contains all of it."""
     spec = draw_plant(HEAVY, 1, "realistic")
     open_, there = site_of("open-water", spec), vehicle_at("open-water", HEAVY)
     assert open_.body == spec.body and open_.basin == OPEN and open_.tether is None
@@ -41,7 +41,8 @@ def test_open_water_has_no_walls_in_reach_but_a_stream_waves_and_a_vehicle_that_
 
 
 def test_sites_and_systems_that_do_not_exist_are_refused():
-    """With what there is; so is a camera over open water, and a vehicle without room in the tank."""
+    """The refusal lists what exists; a camera over open water and a vehicle too large for the tank are
+    refused too."""
     spec = draw_plant(HEAVY, 1, "nominal")
     with pytest.raises(PlantSpecError, match=", ".join(SITES)):
         site_of("pond", spec)
@@ -56,7 +57,8 @@ def test_sites_and_systems_that_do_not_exist_are_refused():
 
 @pytest.mark.parametrize("name", ["finsrov", "bluerov2_heavy"])
 def test_the_camera_over_the_tank_finds_the_vehicle_down_to_the_floor(name):
-    """It hangs three times as high as over the pool, with as many more pixels; the pool's own stays the paper's."""
+    """It hangs three times as high as over the pool, with proportionally more pixels; the pool's camera is
+    the paper's."""
     vehicle = load_vehicle(name)
     basin = site_of("tank", draw_plant(vehicle, 1, "realistic")).basin
     true, _, settings = camera_of(vehicle, 1, "realistic", basin=basin)
@@ -70,7 +72,7 @@ def test_the_camera_over_the_tank_finds_the_vehicle_down_to_the_floor(name):
 
 @pytest.mark.parametrize(("name", "kind"), [("motion-capture", POSE), ("usbl", POSITION)])
 def test_fixes_come_at_their_rate_late_and_with_their_noise(name, kind):
-    """Over many fixes of a vehicle at rest; outliers are as frequent as they are said to be."""
+    """Checked over many fixes of a vehicle at rest; outliers are as frequent as specified."""
     s, system = POSITIONING[name], Positioning(POSITIONING[name], 3)
     duration = 1000.0 / s.rate
     frames = [
@@ -89,8 +91,9 @@ def test_fixes_come_at_their_rate_late_and_with_their_noise(name, kind):
 
 
 def test_log_and_compass_speak_on_the_wire_of_the_motor_controller():
-    """At their rates and with the stream's velocity over the floor of a vehicle that drifts; no frame without them."""
-    # Neutral, for a tilted vehicle that rises has a part of that in its own axes.
+    """They come at their rates, with the stream's velocity over the floor of a drifting vehicle; without
+    them, no frame."""
+    # Neutral, because a tilted vehicle that rises has a part of that velocity in its own axes.
     neutral = HEAVY.replace({"body.displaced_volume": 0.0135})
     spec = site_of("open-water", draw_plant(neutral, 1, "realistic"))
     for vehicle, expected in ((vehicle_at("open-water", neutral), True), (neutral, False)):
@@ -105,7 +108,7 @@ def test_log_and_compass_speak_on_the_wire_of_the_motor_controller():
         log = np.array([aid.values for aid in aids if aid.kind == VELOCITY])
         assert len(log) == pytest.approx(160, rel=0.05)
         assert sum(aid.kind == HEADING for aid in aids) == pytest.approx(400, rel=0.05)
-        # Added to the water's drag it takes a while: after 20 s it goes with the stream.
+        # Starting from rest it needs a while: after 20 s it moves with the stream.
         np.testing.assert_allclose(np.linalg.norm(log[-20:, :2].mean(axis=0)), 0.1, atol=0.03)
         np.testing.assert_allclose(log[-1, :2], world.plant.nu[:2], atol=0.04)
 
@@ -113,14 +116,14 @@ def test_log_and_compass_speak_on_the_wire_of_the_motor_controller():
 @pytest.mark.slow
 @pytest.mark.parametrize("positioning", ["none", "usbl"])
 def test_a_vehicle_finds_its_way_in_open_water(positioning):
-    """12 s through stream and waves by its own estimate: near the way, and its error within its own doubt."""
+    """For 12 s through stream and waves it stays near the path, with an error within its own uncertainty."""
     told = swim(HEAVY, way_of("line", 12.0, 0.3), plant=2, positioning=positioning, seed=2)
     assert told["fault"] == "" and told["way_m"] == pytest.approx(3.6, abs=0.5)
     assert told["drift_m"] < 0.25 and told["off_m"] < 0.5 and told["nees"] < 13.8
 
 
 def test_ways_keep_their_speed():
-    """A square of 10 m is finished; a line is as long as it takes."""
+    """A square of 10 m is finished; a line lasts as long as its length requires."""
     for shape in ("line", "square"):
         way = way_of(shape, 100.0, 0.3)
         speed = np.linalg.norm(way.at(np.linspace(0.1, way.duration - 0.1, 333)).velocity, axis=1)
@@ -131,7 +134,7 @@ def test_ways_keep_their_speed():
 
 
 def test_a_water_file_adds_to_the_site(tmp_path):
-    """A vehicle that hangs in open water drifts with the profile at its depth, and a plant file keeps the water."""
+    """A passive vehicle in open water drifts with the profile at its depth, and a plant file keeps the water."""
     (tmp_path / "p.csv").write_text("depth,east,north\n0,0.3,0\n8,0.0,0.3\n", encoding="utf-8")
     (tmp_path / "water.yaml").write_text(
         "current: p.csv\nwaves: {spectrum: jonswap, height: 0.05, period: 3.0}\n"

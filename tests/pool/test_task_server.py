@@ -1,4 +1,5 @@
-"""Several vehicles in real time: one process is the water, others are the robots; one camera sees the tags of all."""
+"""Several vehicles in real time: one process simulates the water, others are the robots; one camera sees all
+tags."""
 
 import json
 import signal
@@ -28,7 +29,8 @@ HERE = Track(np.array([1.0, 2.0, -3.0]), np.array([0.0, 0.0, 0.0, 1.0]), np.zero
 
 
 def test_a_message_reaches_the_others_and_nobody_under_a_strange_name():
-    """Over sockets: what `left` sends comes to `right`, not back; what an eel sends comes to nobody."""
+    """Over sockets, a message of `left` reaches `right` but not `left`; a message of an unknown `eel` reaches
+    no one."""
     server = MediumServer(
         ("127.0.0.1", 0), Medium(lambda: dict.fromkeys(("left", "right"), np.zeros(3))), ("left", "right")
     )
@@ -50,7 +52,8 @@ def test_a_message_reaches_the_others_and_nobody_under_a_strange_name():
 
 @pytest.mark.slow
 def test_one_camera_tells_vehicles_apart_by_their_tags():
-    """Three FinsROV in the pool, every picture with the tags of all: each knows where it is and goes where it is to."""
+    """Three FinsROV in the pool, with everyone's tags in every picture, each locate themselves and reach
+    their goals."""
     finsrov = load_vehicle("finsrov")
     fleet, known = swimming([finsrov] * 3, SiteChoice(severity="nominal"), None)
     names, sent = list(fleet.worlds), {name: [] for name in fleet.worlds}
@@ -92,7 +95,7 @@ def test_one_camera_tells_vehicles_apart_by_their_tags():
     ],
 )
 def test_what_a_team_cannot_do_is_refused(words, sentence, capsys):
-    """In one sentence, before a socket is opened."""
+    """Each is refused in one sentence, before a socket is opened."""
     assert boundary.run(app, words) == 2
     assert sentence in " ".join(capsys.readouterr().err.split())
 
@@ -105,7 +108,7 @@ def free_port():
 
 @pytest.mark.slow
 def test_one_command_runs_a_team_and_who_is_lost_stops_alone(tmp_path, slow_clock):
-    """Three processes of robots, told of each other by the site; one is killed, and the others end in their time."""
+    """The site connects three robot processes; one is killed, and the others end on time."""
     port = free_port()
     finssim, ends = [sys.executable, "-m", "finssim"], ["--robot", f"127.0.0.1:{port + 100}"]
     words = "--team finsrov,finsrov,finsrov --task formation --plant 0 --severity nominal --seed 3"
@@ -137,7 +140,7 @@ def test_one_command_runs_a_team_and_who_is_lost_stops_alone(tmp_path, slow_cloc
 
 
 def process_of(team, name, record):
-    """Process of an agent, once it has recorded for some seconds."""
+    """Return the process of an agent, once it has recorded for some seconds."""
     end = time.monotonic() + 120.0
     while not (record.exists() and record.stat().st_size > 100_000):
         assert time.monotonic() < end and team.poll() is None
@@ -152,7 +155,8 @@ def process_of(team, name, record):
 @pytest.mark.slow
 @pytest.mark.parametrize(("task", "policy"), [("pursuit", "lead"), ("t3", "pid")])
 def test_who_pursues_in_another_process_is_told_of_the_prey_and_follows_it(task, policy, slow_clock):
-    """Of the prey or the goal that moves; located by motion capture on its wire, it decides ten times a second."""
+    """It receives the prey or the moving goal, is located by motion capture on its wire, and decides ten
+    times a second."""
     port = free_port()
     finssim = [sys.executable, "-m", "finssim"]
     words = f"pool --task {task} --plant 0 --severity nominal --positioning motion-capture".split()

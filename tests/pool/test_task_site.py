@@ -1,4 +1,5 @@
-"""Every task through the deployed software: stack, wire, motor controller and plant of each vehicle, in lock-step."""
+"""Every task with the deployed software: stack, wire, motor controller and plant of each vehicle, in
+lock-step."""
 
 import json
 from dataclasses import replace
@@ -38,19 +39,19 @@ SHORT = {
     "net": 32.0,
     "pipeline": 31.0,
 }
-"""Time limits that are long enough for a success of the baseline [s]."""
+"""Time limits long enough for the baseline to succeed [s]."""
 SMALL = {"path": {"legs": 20}, "waypoints": {"legs": 1}, "terrain": {"line": 15.0}}
-"""Less than a third of the way."""
+"""Settings that shorten these tasks to less than a third."""
 SEEDS = {"camera-docking": 4, "pipeline": 2, "gate": 4, "pursuit": 11, "formation": 8}
-"""Of an episode in which the baseline succeeds soon; that of a task that sees does not in all."""
+"""Seeds of episodes in which the baseline succeeds soon; in tasks with vision it does not succeed in all."""
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "name", [name for name in TASKS if name != "velocity6"]
-)  # whose commands are in training alone
+)  # commands exist in training alone
 def test_the_baseline_of_every_task_succeeds_through_the_stack(name):
-    """Scored by the task itself on the true state; nobody is stopped, everybody decides at the task's rate."""
+    """The task itself scores the true state; no vehicle is stopped, and all decide at the task's rate."""
     (who, *_), task = baselines_of(name), task_named(name)
     if task.pictures or task.ranges:
         pytest.importorskip("newton", reason="finssim[perception] is not installed")
@@ -66,14 +67,15 @@ def test_the_baseline_of_every_task_succeeds_through_the_stack(name):
 
 
 def test_a_task_whose_commands_are_drawn_is_refused():
-    """Before anything starts, with what commands it on a robot."""
+    """The refusal comes before anything starts and names the source of commands on a robot."""
     with pytest.raises(ControlError, match="the velocity and the heading of a trajectory"):
         site_of("velocity6", "pid", [FINSROV])
 
 
 @pytest.mark.slow
 def test_a_policy_of_ones_own_task_runs_through_the_stack(tmp_path):
-    """In Warp; one in torch does in evaluation/test_records_measured.py. A linear policy directory holds the depth."""
+    """In Warp (evaluation/test_records_measured.py has one in torch), a linear policy directory holds the
+    depth."""
     words = f"{EXAMPLES / 'own_task.py'}:KeepDepth"
     task = task_named(words)
     gain = np.zeros((6, 2), np.float32)
@@ -87,8 +89,8 @@ def test_a_policy_of_ones_own_task_runs_through_the_stack(tmp_path):
 
 @pytest.mark.slow
 def test_what_a_task_sees_is_what_it_would_see_in_training():
-    """The same dock in the same place for the same seed, funnel and picture included; the picture at the start agrees
-    with that of the batch but for noise and exposure."""
+    """Equal seeds give the same dock pose, funnel and picture; the first picture agrees with that of the batch except
+    for noise and exposure."""
     pytest.importorskip("newton", reason="finssim[perception] is not installed")
     batch = Environment(task_named("camera-docking"), worlds=1, seed=9)
     site = site_of("camera-docking", "light-servo", [FINSROV], seed=9)
@@ -110,9 +112,9 @@ def test_what_a_task_sees_is_what_it_would_see_in_training():
 @pytest.mark.slow
 @pytest.mark.parametrize("beam", ["ray", "ping"])
 def test_altimeters_measure_the_seabed_of_training(tmp_path, beam):
-    """In the described world, wherever the vehicle is: rays to 3 cm, for the seabed is straight within a metre.
+    """In the described world rays agree to 3 cm wherever the vehicle is, as the seabed is straight within a metre.
 
-    Beams of a Ping to 3 %: 61 rays stand for one, and training has a plane where they meet the seabed.
+    Beams of a Ping agree to 3 %: 61 rays represent one, and training assumes a plane where they meet the seabed.
     """
     pytest.importorskip("newton", reason="finssim[perception] is not installed")
     device = tmp_path / "narrow.yaml"
@@ -156,7 +158,7 @@ def test_an_episode_over_a_seabed_that_is_in_no_record_is_not_scored():
 
 @pytest.mark.slow
 def test_the_command_keeps_its_episodes_and_goes_on(tmp_path, capsys, monkeypatch):
-    """The second call plays the second episode alone, and prints both beside the batch."""
+    """The second call plays only the second episode, and prints both beside the batch."""
     monkeypatch.setattr(stack, "BATCH", 32)
     monkeypatch.setitem(Docking.__init__.__kwdefaults__, "time_limit", 25.0)
     words = ["docking", "--policy", "align-insert", "--out", tmp_path, "--json", "--episodes"]
@@ -179,7 +181,7 @@ def test_a_site_without_what_its_task_needs_is_refused(capsys):
 
 @pytest.mark.slow
 def test_a_lost_vehicle_stops_alone():
-    """The right netter falls silent after a second and is stopped; the others go on with what they heard last."""
+    """The right netter falls silent after a second and is stopped; the others continue with its last message."""
     site = site_of("team-pursuit", "formation", [FINSROV] * 4, seed=2)
     lost = site.worlds["right_netter"]
     before = lost.exchange
@@ -197,7 +199,8 @@ def test_a_lost_vehicle_stops_alone():
 
 
 def test_messages_are_late_by_the_way_and_lost_as_often_as_told():
-    """15 m at 1500 m/s and 0.1 s; a loss of one in four of 4000 datagrams, to 3 standard deviations."""
+    """The delay is 15 m at 1500 m/s plus 0.1 s; one in four of 4000 datagrams is lost, to 3 standard
+    deviations."""
     places = {"a": np.zeros(3), "b": np.array([15.0, 0.0, 0.0])}
     medium = Medium(lambda: places, Communication(loss=0.25), seed=1)
     heard = 0

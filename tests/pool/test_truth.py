@@ -1,4 +1,4 @@
-"""The truth file: whole up to wherever it was cut."""
+"""The truth file is readable up to any cut."""
 
 import os
 import signal
@@ -19,7 +19,7 @@ def values(i):
 
 
 def test_what_is_written_is_read(tmp_path):
-    """Every column, in single precision; the time in double."""
+    """Every column is read back in single precision, the time in double."""
     writer = TruthWriter(tmp_path / "a.truth", THRUSTERS, {"seed": 4})
     for i in range(10):
         writer.write(1000.0 + 0.01 * i, values(i))
@@ -32,7 +32,7 @@ def test_what_is_written_is_read(tmp_path):
 
 
 def test_a_cut_file_opens_up_to_the_cut(tmp_path):
-    """Wherever the end is, the whole records before it are there."""
+    """All complete records before the cut are read."""
     writer = TruthWriter(tmp_path / "a.truth", THRUSTERS, {})
     for i in range(5):
         writer.write(float(i), values(i))
@@ -44,7 +44,7 @@ def test_a_cut_file_opens_up_to_the_cut(tmp_path):
 
 @pytest.mark.slow
 def test_a_killed_writer_leaves_all_but_the_last_records(tmp_path):
-    """kill -9 loses at most what was not yet handed to the system."""
+    """kill -9 loses at most the data not yet passed to the operating system."""
     script = (
         "import sys, time, numpy as np\n"
         "from finssim.pool.virtual_pool import TruthWriter\n"
@@ -62,7 +62,7 @@ def test_a_killed_writer_leaves_all_but_the_last_records(tmp_path):
 
 
 def test_a_full_disk_ends_the_file_and_not_the_pool(tmp_path, caplog):
-    """Writing goes on without an error, and the log says what happened, once."""
+    """Writing continues without an error, and the log reports it once."""
     if not os.path.exists("/dev/full"):
         pytest.skip("needs /dev/full")
     writer = TruthWriter(tmp_path / "a.truth", THRUSTERS, {})
@@ -74,7 +74,7 @@ def test_a_full_disk_ends_the_file_and_not_the_pool(tmp_path, caplog):
 
 
 def test_what_is_no_truth_file_is_refused(tmp_path):
-    """One sentence for a missing file, another for a foreign one."""
+    """A missing file and a foreign file are refused with different sentences."""
     with pytest.raises(TruthError, match="cannot be read"):
         read_truth(tmp_path / "none")
     (tmp_path / "other").write_text("time,x\n0,1\n")

@@ -1,4 +1,4 @@
-"""The virtual pool: a robot on the other end of the wire, with nothing but frames."""
+"""The virtual pool as a robot sees it: through frames on the wire only."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ def command(normalised=STILL, enable=True):
 
 
 def driven(pool, duration, normalised=STILL, enable=True, rate=60.0):
-    """Messages of the vehicle while it is sent the same command at a rate."""
+    """Return the vehicle's messages while it is sent the same command at a rate."""
     decoder, messages = Decoder(), []
     start = pool.time
     for i in range(1, round(duration * rate) + 1):
@@ -31,7 +31,7 @@ def driven(pool, duration, normalised=STILL, enable=True, rate=60.0):
 
 
 def forward(pool, force=2.0):
-    """Command that asks each thruster, by the file's curve, for its share of a surge force."""
+    """Return the command that gives each thruster, by the file's curve, its share of a surge force."""
     vehicle = pool.vehicle
     share = np.linalg.pinv(vehicle.thruster_matrix()) @ (force * np.eye(6)[0])
     normalised = np.zeros(vehicle.mcu.outputs)
@@ -43,7 +43,7 @@ def forward(pool, force=2.0):
 
 
 def test_telemetry_comes_at_the_rate_of_the_imu_without_a_gap():
-    """100 frames a second, numbered one by one, each a few milliseconds old when it arrives."""
+    """100 frames a second arrive, numbered consecutively, each a few milliseconds old."""
     pool = VirtualPool(FINSROV, draw_plant(FINSROV, 1, "realistic"))
     messages = driven(pool, 2.0)
     assert 198 <= len(messages) <= 200
@@ -52,7 +52,7 @@ def test_telemetry_comes_at_the_rate_of_the_imu_without_a_gap():
 
 
 def test_frames_arrive_after_they_are_sent_and_in_time():
-    """Arrivals are sorted, not after the exchange, and never before the sample plus the IMU's latency."""
+    """Arrivals are sorted, no later than the exchange, and no earlier than the sample plus the IMU's latency."""
     pool = VirtualPool(FINSROV, draw_plant(FINSROV, 1, "realistic"))
     arrivals = []
     for i in range(1, 61):
@@ -76,7 +76,7 @@ def test_a_commanded_vehicle_moves_and_an_idle_one_does_not():
 
 
 def test_equal_seeds_give_equal_frames_and_other_seeds_do_not():
-    """Everything that a robot sees repeats, byte by byte."""
+    """All data that a robot receives repeat, byte by byte."""
     spec = draw_plant(FINSROV, 3, "realistic")
 
     def frames(seed):
@@ -87,7 +87,7 @@ def test_equal_seeds_give_equal_frames_and_other_seeds_do_not():
 
 
 def test_lengths_of_the_exchanges_do_not_change_the_world():
-    """The same commands at the same times give the same motion, however often the robot looks."""
+    """The same commands at the same times give the same motion, however often the robot exchanges."""
     ends = []
     for rate in (60, 240):
         pool = VirtualPool(FINSROV, draw_plant(FINSROV, 2, "realistic"))
@@ -109,7 +109,7 @@ def test_time_never_goes_back():
 
 
 def test_a_camera_is_asked_for_every_interval_and_can_look_back():
-    """Intervals join without a gap; the pose between two steps is between their poses."""
+    """Intervals join without a gap; a pose between two steps lies between their poses."""
 
     class Watcher:
         def __init__(self):
@@ -131,7 +131,7 @@ def test_a_camera_is_asked_for_every_interval_and_can_look_back():
 
 
 def test_start_and_truth(tmp_path):
-    """The vehicle starts where it was put, and the truth file has every record, the first at time 0."""
+    """The vehicle starts at the given pose, and the truth file has every record, the first at time 0."""
     start = ((0.3, -0.2, -0.4), (0.0, 0.0, 0.6, 0.8))
     pool = VirtualPool(
         FINSROV,
@@ -172,7 +172,7 @@ def test_telemetry_is_the_truth_through_the_instruments():
 
 
 def test_faults_and_a_reboot_reach_the_robot():
-    """Losses thin the telemetry out, lost commands stop the motors, a reboot is 1.5 s of silence."""
+    """Losses thin out telemetry, lost commands stop the motors, a reboot is 1.5 s of silence."""
     pool = VirtualPool(FINSROV, draw_plant(FINSROV, 1, "realistic"))
     pool.faults.drop = 0.5
     assert 30 <= len(driven(pool, 1.0)) <= 70
@@ -183,14 +183,14 @@ def test_faults_and_a_reboot_reach_the_robot():
     assert not pool.firmware.target.any()
     pool.faults.drop_commands = 0.0
     pool.reboot()
-    pool.exchange(pool.time + 0.01)  # what was on its way still comes
+    pool.exchange(pool.time + 0.01)  # frames in transit still arrive
     assert driven(pool, 1.4) == []
     again = driven(pool, 0.5)
     assert again[0].sequence == 1 and again[0].mcu_ms < 50
 
 
 def test_an_hour_costs_no_memory_of_its_own():
-    """What is kept does not grow with time: queues and poses stay as they are after a second."""
+    """Memory does not grow with time: queues and poses keep the size that they have after a second."""
     pool = VirtualPool(FINSROV, draw_plant(FINSROV, 1, "realistic"))
     driven(pool, 2.0)
     sizes = len(pool._up), len(pool._down), len(pool._poses)

@@ -37,7 +37,7 @@ AHEAD = Station(START, 0.0, name="ahead")
 
 
 class Scripted:
-    """Ahead with the propeller; after a while with a rudder that turns to starboard."""
+    """Ahead with the propeller, later with the rudder to starboard."""
 
     name, period, needs_state = "script", 0.1, True
 
@@ -65,13 +65,14 @@ def water():
 
 @pytest.mark.slow
 def test_a_scripted_pilot_turns_a_torpedo_and_is_recorded(tmp_path):
-    """The bow goes to starboard, values follow requests, and after the end fins are at 0 and the engine stays."""
+    """The bow turns to starboard and values follow requests; after the end the fins are at 0 and the engine
+    keeps its value."""
     world = water()
     with Recorder(tmp_path / "run.mcap", TORPEDO) as recorder:
         runtime = robot(recorder)
         run_lockstep(runtime, world, 8.0)
     assert runtime.bridge.reason == "" and world.plant.nu[0] > 1.0 and world.plant.nu[5] < -0.1
-    world.exchange(world.time + 0.4)  # less than the firmware's own timeout: this was the bridge
+    world.exchange(world.time + 0.4)  # less than the firmware's own timeout, so the bridge caused this
     np.testing.assert_allclose(world.plant.values, [0.0, 0.0, 2e-4, 0.0], atol=0.01)
     assert world.plant.values[2] == pytest.approx(2e-4, rel=1e-3)
     with open_record(tmp_path / "run.mcap") as record:
@@ -87,7 +88,8 @@ def test_a_scripted_pilot_turns_a_torpedo_and_is_recorded(tmp_path):
 
 @pytest.mark.slow
 def test_a_run_along_a_path_stays_on_it(capsys, tmp_path):
-    """`finssim run` by line of sight, autopilot, wire and fins: at 2 m/s within a metre of a way that dives."""
+    """`finssim run` with line of sight, autopilot, wire and fins stays within a metre of a descending path at
+    2 m/s."""
     file, way, truth = torpedo_file(tmp_path), tmp_path / "way.csv", tmp_path / "truth"
     way.write_text("t,x,y,z\n0,0,0,-8\n20,30,0,-8\n40,55,15,-10\n", encoding="utf-8")
     words = f"run --vehicle {file} --site open-water --pool-file none --let-in 0,0 --lockstep".split()
@@ -96,7 +98,7 @@ def test_a_run_along_a_path_stays_on_it(capsys, tmp_path):
         status = boundary.run(app, [*map(str, words), "--robot", wiring.robot])
     report = json.loads(capsys.readouterr().out)
     assert status == 0 and report["state"] == "armed" and report["faults"] == []
-    assert report["position_rms_m"] < 0.3  # beside the path, by the estimate
+    assert report["position_rms_m"] < 0.3  # distance from the path, by the estimate
     path, leg = Waypoints.along(load_trajectory(way)), np.zeros(1, dtype=int)
     true, worst = read_truth(truth), 0.0
     for x in true.position[true.time > 8.0]:
@@ -106,7 +108,7 @@ def test_a_run_along_a_path_stays_on_it(capsys, tmp_path):
 
 
 def test_an_agent_of_all_channels_commands_them():
-    """Mode `surfaces`: parts of the limits of propeller, fins, engine and mass."""
+    """Actions of mode `surfaces` are fractions of the limits of propeller, fins, engine and mass."""
 
     class Agent:
         name, period, action, wrench_scale = "agent", 0.1, "surfaces", 1.0
@@ -127,7 +129,7 @@ def test_an_agent_of_all_channels_commands_them():
 
 @pytest.mark.slow
 def test_a_robot_does_not_arm_on_a_controller_of_version_1():
-    """Its telemetry has no actuators: one sentence, and no thruster turns."""
+    """Telemetry of version 1 has no actuators: arming is refused in one sentence, and no thruster turns."""
     world = water()
 
     class Old:

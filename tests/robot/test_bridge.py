@@ -1,4 +1,4 @@
-"""The bridge: only arming starts thrusters, and every watchdog stops them."""
+"""The bridge enables thrusters only when armed, and every watchdog stops them."""
 
 import math
 
@@ -24,7 +24,8 @@ def rig():
 
 @pytest.mark.parametrize("name", THRUSTED)
 def test_every_vehicle_runs_once_armed_and_not_before(name):
-    """With or without an mcu and a safety section: zeros until armed, thrust after it, zeros when disarmed."""
+    """With or without an mcu and a safety section: zeros until armed, thrust while armed, zeros when
+    disarmed."""
     vehicle = load_vehicle(name)
     rig = Rig(vehicle)
     assert all(map(quiet, rig.run(0.3)))
@@ -36,7 +37,7 @@ def test_every_vehicle_runs_once_armed_and_not_before(name):
 
 
 def test_thrust_needs_arming_and_no_command_arms(rig):
-    """Commands to a disarmed bridge return zeros and move nothing, however many come."""
+    """A disarmed bridge answers any number of commands with zeros and does not arm."""
     assert all(map(quiet, rig.run(3.0, 5.0)))
     assert not rig.bridge.command(rig.now, np.ones(8), "pid").any()
 
@@ -59,7 +60,7 @@ def test_thrust_needs_arming_and_no_command_arms(rig):
     ],
 )
 def test_arming_is_refused_with_one_sentence(rig, spoil, why):
-    """Each thing that stands against arming is named, and the state stays what it was."""
+    """Each obstacle to arming is named, and the state does not change."""
     rig.run(0.2)
     spoil(rig)
     before = rig.bridge.state
@@ -68,7 +69,7 @@ def test_arming_is_refused_with_one_sentence(rig, spoil, why):
 
 
 def test_a_bridge_that_heard_nothing_cannot_be_armed():
-    """Neither telemetry nor an estimator: refused."""
+    """Without telemetry and without an estimator, arming is refused."""
     bridge = Bridge(FINSROV)
     assert "telemetry" in bridge.arm(5.0, "operator")
     bridge.telemetry(5.0, telemetry(1))
@@ -76,7 +77,7 @@ def test_a_bridge_that_heard_nothing_cannot_be_armed():
 
 
 def test_teleoperation_may_arm_without_localization():
-    """With need_reading=False telemetry alone is enough, and the loss of vision does not stop the operator."""
+    """With need_reading=False telemetry alone is enough, and losing vision does not stop the operator."""
     rig = Rig(FINSROV, need_reading=False)
     rig.run(0.2, reading_=None)
     assert rig.bridge.arm(rig.now, "pad") == ""
@@ -85,7 +86,7 @@ def test_teleoperation_may_arm_without_localization():
 
 
 def spoiled_telemetry(**changes):
-    """Turns of the loop in which the motor controller says something else."""
+    """Return loop turns in which the motor controller's telemetry has these changes."""
     return lambda rig: rig.step(2.0, telemetry_=lambda k, n: telemetry(k, n, **changes))
 
 
@@ -112,7 +113,8 @@ FAULTS = {
 
 @pytest.mark.parametrize("name", FAULTS)
 def test_a_fault_stops_until_it_is_acknowledged(rig, name):
-    """Zeros within the limit and one turn; the condition's end, commands and arming change nothing; then disarmed."""
+    """Zeros within the limit plus one turn; the end of the condition, commands and arming do not clear the
+    fault."""
     spoil, why, limit = FAULTS[name]
     rig.armed()
     began = rig.now
@@ -153,7 +155,8 @@ WAITS = {
 
 @pytest.mark.parametrize("name", WAITS)
 def test_a_passing_condition_holds_and_thrust_returns_by_itself(rig, name):
-    """Disabled zeros while it lasts, thrust with the first command after it, fault once it lasts 5 s."""
+    """A hold sends disabled zeros, thrust returns with the first command afterwards; after 5 s it becomes a
+    fault."""
     spoil, why, limit = WAITS[name]
     rig.armed()
     began = rig.now
@@ -165,7 +168,7 @@ def test_a_passing_condition_holds_and_thrust_returns_by_itself(rig, name):
         spoil(rig)
         assert quiet(rig.frame)
     rig.run(0.1)
-    assert rig.bridge.state == "hold"  # nothing moves before somebody commands it
+    assert rig.bridge.state == "hold"  # nothing moves before the first command
     rig.run(0.1, 2.0)
     assert rig.bridge.state == "armed" and moves(rig.frame)
     while rig.bridge.state != "fault":
@@ -175,7 +178,7 @@ def test_a_passing_condition_holds_and_thrust_returns_by_itself(rig, name):
 
 
 def test_a_controller_that_is_silent_for_want_of_a_state_is_not_blamed(rig):
-    """The estimator's reason stands, in hold and in the fault that it becomes."""
+    """The reported reason is the estimator's, both in hold and in the fault that follows."""
     rig.armed()
     rig.run(2.0, reading_=lambda t: reading(t, ready=False, reason="no depth"))
     assert rig.bridge.state == "hold" and "no depth" in rig.bridge.reason
@@ -184,7 +187,7 @@ def test_a_controller_that_is_silent_for_want_of_a_state_is_not_blamed(rig):
 
 
 def test_the_operator_may_hold_for_as_long_as_needed(rig):
-    """No limit on the operator's own hold, no thrust in it, and other dangers still become faults."""
+    """The operator's own hold has no time limit and no thrust; other conditions still become faults."""
     rig.armed()
     rig.bridge.hold(rig.now)
     assert all(map(quiet, rig.run(20.0, 2.0))) and rig.bridge.state == "hold"
@@ -198,7 +201,7 @@ def test_the_operator_may_hold_for_as_long_as_needed(rig):
 
 @pytest.mark.parametrize("jump", [-0.5, -3600.0, 1.5, 1e9, math.nan, math.inf])
 def test_a_clock_that_jumps_is_a_fault(rig, jump):
-    """Backwards, more than a second forwards, or no time at all."""
+    """A clock that jumps backwards, jumps more than a second forwards or is not a number causes a fault."""
     rig.armed()
     assert quiet(rig.bridge.tick(rig.now + jump)) and "clock" in rig.bridge.reason
     rig.bridge.acknowledge(rig.now)
@@ -206,7 +209,7 @@ def test_a_clock_that_jumps_is_a_fault(rig, jump):
 
 
 def test_a_loop_that_stood_still_is_a_fault(rig):
-    """Messages kept coming, but nobody ticked for more than a second: thrust would have been blind."""
+    """Messages kept arriving, but for more than a second the loop did not tick: thrust would have been blind."""
     rig.armed()
     for _ in range(65):
         rig.now, rig.count = rig.now + DT, rig.count + 1
@@ -217,7 +220,7 @@ def test_a_loop_that_stood_still_is_a_fault(rig):
 
 
 def test_lost_repeated_and_overtaken_messages_are_no_fault(rig):
-    """Half of the telemetry lost, every message twice, and old ones in between: the vehicle runs on."""
+    """Losing half of the telemetry, repeating every message and mixing in old ones does not stop the vehicle."""
     rig.armed()
     for turn in range(240):
         rig.step(2.0, telemetry_=telemetry if turn % 2 else None)
@@ -227,7 +230,7 @@ def test_lost_repeated_and_overtaken_messages_are_no_fault(rig):
 
 
 def test_counters_of_the_controller_may_roll_over(rig):
-    """Sequence modulo 2^16 and clock modulo 2^32 pass their ends without a fault."""
+    """The sequence (modulo 2^16) and the clock (modulo 2^32) roll over without a fault."""
     rig.armed()
 
     def rolling(k, n):
@@ -244,7 +247,7 @@ def test_counters_of_the_controller_may_roll_over(rig):
 
 
 def test_refused_commands_become_a_fault_if_it_lasts(rig):
-    """One rejected command is an event; nothing but rejections for half a second is a fault."""
+    """One rejected command is an event; half a second of nothing but rejections is a fault."""
     rig.armed()
     rig.bridge.drain()
     rig.bridge.echo(rig.now, echo(1))
@@ -260,7 +263,8 @@ def test_refused_commands_become_a_fault_if_it_lasts(rig):
 
 
 def test_a_controller_that_hears_no_command_is_a_fault(rig):
-    """By its status bits: one that follows, or tells nothing of it, is none; one that follows now and then neither."""
+    """Status bits decide: a controller that follows commands, even intermittently, or does not report it is
+    not at fault."""
     rig.armed()
     told = StatusFlag.DIAGNOSTICS
     rig.run(1.0, 2.0, telemetry_=lambda k, n: telemetry(k, n, flags=int(told | StatusFlag.DIRECT_THRUSTERS)))
@@ -273,17 +277,17 @@ def test_a_controller_that_hears_no_command_is_a_fault(rig):
 
 
 def test_a_count_of_commands_that_begins_again_is_a_restart(rig):
-    """An echo with a smaller count and a later clock: the controller restarted."""
+    """An echo with a smaller count and a later clock means that the controller restarted."""
     rig.armed()
     rig.bridge.echo(rig.now, echo(500, mcu_ms=50_000))
-    rig.bridge.echo(rig.now, echo(499, mcu_ms=49_990))  # overtaken
+    rig.bridge.echo(rig.now, echo(499, mcu_ms=49_990))  # arrived out of order
     assert rig.bridge.state == "armed"
     rig.bridge.echo(rig.now, echo(3, mcu_ms=50_100))
     assert rig.bridge.state == "fault" and "began again" in rig.bridge.reason
 
 
 def test_commands_are_limited_in_force_and_in_slew():
-    """±50 N become the limits of each thruster, reached at the settings' rate."""
+    """±50 N are clipped to the limits of each thruster, which are approached at the configured slew rate."""
     rig = Rig(FINSROV, slew=np.full(8, 20.0))
     rig.run(0.2)
     rig.bridge.arm(rig.now, "operator")
@@ -298,7 +302,7 @@ def test_commands_are_limited_in_force_and_in_slew():
 
 
 def test_thrust_after_a_hold_begins_at_zero():
-    """What was under way before the hold is not carried over it: the slew limit starts from nothing."""
+    """The slew limit restarts from zero after a hold; thrust from before it is not carried over."""
     rig = Rig(FINSROV, slew=np.full(8, 20.0)).armed()
     rig.bridge.hold(rig.now)
     rig.run(0.2, 2.0)
@@ -311,7 +315,7 @@ def test_thrust_after_a_hold_begins_at_zero():
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 def test_near_a_face_thrust_only_pushes_inwards(rig, axis, side):
-    """Outward force is taken away, inward force and the moment stay, whatever the heading."""
+    """Outward force is removed, inward force and the moment remain, at any heading."""
     rig.armed()
     position = np.array([0.0, 0.0, -0.5])
     face = FINSROV.safety.workspace_upper if side > 0 else FINSROV.safety.workspace_lower
@@ -332,7 +336,7 @@ def test_near_a_face_thrust_only_pushes_inwards(rig, axis, side):
 
 
 def test_a_face_that_thrust_cannot_avoid_stops_it():
-    """A vehicle with one thruster along its axis, heading out of the box, gets none."""
+    """A vehicle with one thruster along its axis gets no thrust when it heads out of the box."""
     lauv = load_vehicle("lauv")
     rig = Rig(lauv, workspace_lower=np.full(3, -9.0), workspace_upper=np.full(3, 9.0))
     rig.armed()
@@ -342,7 +346,7 @@ def test_a_face_that_thrust_cannot_avoid_stops_it():
 
 
 def test_events_tell_what_happened_once(rig):
-    """A state change is one event; a thousand refused commands are one line a second."""
+    """A state change is one event; a thousand refused commands are logged as one line per second."""
     rig.armed()
     for _ in range(1000):
         rig.bridge.command(rig.now, np.ones(3), "pid")
@@ -365,13 +369,13 @@ def test_events_tell_what_happened_once(rig):
     ],
 )
 def test_limits_that_cannot_be_kept_are_refused(changes, why):
-    """Each is named with what was expected."""
+    """Each invalid limit is named together with what was expected."""
     with pytest.raises(BridgeError, match=why):
         BridgeSettings.of(FINSROV, **changes)
 
 
 def test_a_slew_for_another_vehicle_is_refused():
-    """One rate per thruster."""
+    """The slew must have one rate per thruster."""
     with pytest.raises(BridgeError, match="expected 8"):
         Bridge(FINSROV, BridgeSettings.of(FINSROV, slew=np.ones(6)))
 
@@ -380,12 +384,13 @@ TORPEDO = torpedo()
 
 
 def with_values(*values):
-    """Telemetry of version 2 with these values of the other actuators."""
+    """Return telemetry of version 2 with these values of the other actuators."""
     return lambda k, n: telemetry(k, n, actuators=values)
 
 
 def test_setpoints_follow_the_thrusts_within_the_travel_of_each_actuator():
-    """Channels beyond the thrusters go out as they are, limited; a command of thrusts alone leaves them."""
+    """Channels beyond the thrusters are sent unchanged but limited; a command of thrusts alone leaves them as
+    they are."""
     rig = Rig(TORPEDO)
     at = with_values(0.0, 0.0, 0.0, 0.0)
     rig.run(0.2, telemetry_=at)
@@ -404,7 +409,8 @@ def test_setpoints_follow_the_thrusts_within_the_travel_of_each_actuator():
 
 @pytest.mark.parametrize("end", ["disarm", "stop"])
 def test_fins_go_to_zero_and_an_engine_stays_when_the_bridge_is_not_armed(end):
-    """On disarming and in a fault: the value of `off`, or that of the newest telemetry where the file has none."""
+    """On disarming and in a fault an actuator goes to its `off` value or, without one, keeps the newest
+    measured value."""
     rig = Rig(TORPEDO)
     at = with_values(0.1, 0.1, 3e-4, 0.02)
     rig.run(0.2, telemetry_=at)
@@ -418,7 +424,7 @@ def test_fins_go_to_zero_and_an_engine_stays_when_the_bridge_is_not_armed(end):
 
 
 def test_a_controller_of_version_1_is_refused_where_there_are_other_actuators():
-    """One sentence names the actuators; a vehicle of thrusters alone arms as ever."""
+    """The refusal names the actuators in one sentence; a vehicle with thrusters alone still arms."""
     rig = Rig(TORPEDO)
     rig.run(0.2, telemetry_=lambda k, n: telemetry(k, n))
     reason = rig.bridge.arm(rig.now, "pid")

@@ -1,4 +1,4 @@
-"""Whatever comes in, in whatever order: thrust only while armed, and armed only by `arm` with no fault since."""
+"""Thrust occurs only while armed, and only `arm` with no fault since arms, for any inputs in any order."""
 
 import math
 
@@ -22,7 +22,7 @@ JUMPS = st.sampled_from([-1e6, -3.0, -0.2, 0.0, 0.9, 1.5, 3600.0, math.nan, math
 
 
 class AnyOrder(RuleBasedStateMachine):
-    """A healthy loop that is disturbed at random."""
+    """A healthy loop with random disturbances."""
 
     def __init__(self):
         super().__init__()
@@ -34,7 +34,7 @@ class AnyOrder(RuleBasedStateMachine):
         self.healthy_telemetry = self.healthy_command = -math.inf
 
     def note(self):
-        """A bridge in fault or disarmed lost its permission, however it got there."""
+        """Withdraw the permission of a bridge in fault or disarmed, whatever the cause."""
         if self.bridge.state in ("fault", "disarmed"):
             self.allowed = False
 
@@ -77,7 +77,7 @@ class AnyOrder(RuleBasedStateMachine):
 
     @rule()
     def arm(self):
-        for _ in range(40):  # what was said before may be too fresh to arm on
+        for _ in range(40):  # earlier messages may be too recent to arm on
             self.now, self.count = self.now + DT, self.count + 1
             self.bridge.telemetry(self.now, telemetry(self.count))
             self.bridge.reading(self.now, reading(self.now))
@@ -194,7 +194,7 @@ TestAnyOrder.settings = settings(max_examples=35, stateful_step_count=40)
 
 
 def test_the_machine_gets_under_way():
-    """The property above is about something: its healthy steps do arm the bridge and turn motors."""
+    """The property above is not vacuous: its healthy steps do arm the bridge and turn motors."""
     machine = AnyOrder()
     machine.arm()
     machine.healthy(40, 3.0, True)

@@ -1,4 +1,4 @@
-"""A gamepad through pygame: SDL's own virtual joystick stands in for the plastic."""
+"""A gamepad through pygame; SDL's virtual joystick replaces the hardware."""
 
 import ctypes
 import os
@@ -16,7 +16,7 @@ GAME_CONTROLLER = 1
 
 
 def sdl():
-    """The SDL that pygame has loaded."""
+    """The SDL library that pygame has loaded."""
     folder = Path(pygame.__file__).resolve().parents[1] / "pygame.libs"
     found = sorted(folder.glob("libSDL2-2*"))
     if not found:
@@ -29,7 +29,7 @@ def sdl():
 
 
 class Plastic:
-    """A virtual pad that a test presses."""
+    """A virtual gamepad that a test operates."""
 
     def __init__(self, axes=6, buttons=11):
         os.environ["SDL_VIDEODRIVER"] = "dummy"
@@ -90,7 +90,7 @@ def test_each_button_does_one_thing(plastic, name):
 
 
 def test_a_trigger_that_nobody_touched_pushes_nothing(plastic):
-    """SDL shows 0 for it until it moves, which would be half a pull."""
+    """SDL reports 0 for a trigger until it moves, which would be half a pull."""
     with Gamepad() as pad:
         assert pad.read().heave == 0.0
 

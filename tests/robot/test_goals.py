@@ -1,4 +1,4 @@
-"""A goal that messages tell of goes on as it went."""
+"""A goal received by messages is extrapolated along its last motion."""
 
 import numpy as np
 
@@ -8,10 +8,11 @@ from finssim.robot.goals import HeardGoal
 
 
 def test_a_goal_goes_on_as_it_was_last_heard_to_go():
-    """Heard at 12 s of a guide begun at 10 s: straight on along its own surge; at several times too."""
+    """Heard at 12 s of a guide begun at 10 s, the goal continues straight along its own surge, also at
+    several times."""
     tracks = {}
     goal = HeardGoal(tracks)
-    np.testing.assert_array_equal(goal.at(0.0).position, np.zeros(3))  # nothing heard yet
+    np.testing.assert_array_equal(goal.at(0.0).position, np.zeros(3))  # nothing received yet
     goal.started = 10.0
     surge = np.array([0.2, 0.0, 0.0, 0.0, 0.0, 0.0])
     tracks["target"] = Track(np.array([1.0, 2.0, -3.0]), quat_from_yaw(np.pi / 2), surge, 12.0)
@@ -24,7 +25,7 @@ def test_a_goal_goes_on_as_it_was_last_heard_to_go():
 
 
 def test_a_goal_that_is_no_longer_heard_of_stands_still():
-    """After 2 s: nobody is led away by a message that was lost."""
+    """After 2 s without a message the goal stops, so that a lost message leads no vehicle astray."""
     surge = np.array([0.2, 0.0, 0.0, 0.0, 0.0, 0.0])
     goal = HeardGoal({"target": Track(np.zeros(3), quat_from_yaw(0.0), surge, 12.0)})
     goal.started = 10.0

@@ -1,4 +1,5 @@
-"""Keys of a terminal: held for a moment after each press, read without waiting, the terminal left as it was."""
+"""Keys of a terminal count as held briefly after each press, are read without waiting, and leave the terminal
+restored."""
 
 import io
 import os
@@ -15,7 +16,7 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="terminals of Un
 
 @pytest.fixture
 def terminal():
-    """The keyboard's end and the terminal's end of a pseudo terminal."""
+    """The keyboard's and the terminal's end of a pseudo terminal."""
     ours, theirs = pty.openpty()
     with os.fdopen(theirs, "r", closefd=True) as stream:
         yield ours, stream
@@ -26,7 +27,7 @@ def terminal():
 
 
 def test_a_key_counts_as_held_for_a_moment():
-    """That is the dead-man: nobody at the keys, no thrust."""
+    """The short hold acts as a dead-man switch: no key presses, no thrust."""
     keys = Keys(hold=0.6)
     keys.press(1.0, "w")
     keys.press(1.1, "q")
@@ -72,7 +73,7 @@ def test_gears_stay_and_buttons_do_not():
 
 
 def test_a_held_enter_is_one_press():
-    """It repeats thirty times a second, and the vehicle is armed once."""
+    """Enter repeats thirty times a second, but the vehicle is armed once."""
     keys = Keys()
     shown = []
     for i in range(30):
@@ -82,7 +83,7 @@ def test_a_held_enter_is_one_press():
 
 
 def test_the_terminal_is_read_without_waiting_and_put_back(terminal):
-    """No line buffer and no echo inside; as before afterwards."""
+    """Line buffering and echo are off while reading and restored afterwards."""
     ours, stream = terminal
     before = termios.tcgetattr(stream.fileno())
     with Keyboard(stream) as keyboard:
@@ -104,7 +105,7 @@ def test_the_terminal_is_put_back_after_an_error(terminal):
 
 
 def test_a_closed_terminal_is_a_lost_device(terminal):
-    """As when the ssh connection breaks."""
+    """A closed terminal, as when the ssh connection breaks, counts as a lost device."""
     ours, stream = terminal
     with Keyboard(stream) as keyboard:
         os.write(ours, b"w")

@@ -1,4 +1,4 @@
-"""Robot and world take turns over TCP: nothing is lost on the way, and one that is not there says so."""
+"""Robot and world take turns over TCP: nothing is lost in transit, and an absent world is reported."""
 
 import socket
 import threading
@@ -41,7 +41,7 @@ deliveries = st.builds(
 
 
 def through_a_socket(*messages):
-    """What comes out of a connection that the bytes went in at."""
+    """Return a connection that receives these messages."""
     near, far = socket.socketpair()
     with near, far:
         near.sendall(b"".join(messages))
@@ -51,14 +51,14 @@ def through_a_socket(*messages):
 
 @given(until=finite, sent=st.lists(st.binary(max_size=99), max_size=4))
 def test_a_request_comes_back_as_it_was(until, sent):
-    """Time and frames."""
+    """A request's time and frames survive the round trip."""
     message, end = through_a_socket(encode_request(until, sent))
     assert decode_request(*message) == (until, tuple(sent)) and end is None
 
 
 @given(delivery=deliveries)
 def test_a_delivery_comes_back_as_it_was(delivery):
-    """Frames with their arrivals, pictures with grey values and tags."""
+    """Frames with their arrival times and pictures with grey values and tags survive the round trip."""
     message, _ = through_a_socket(encode_delivery(delivery))
     back = decode_delivery(*message)
     assert (back.time, back.frames) == (delivery.time, delivery.frames)
@@ -73,7 +73,7 @@ def test_a_delivery_comes_back_as_it_was(delivery):
 
 
 def test_a_message_that_is_cut_or_no_message_is_refused():
-    """In the middle of a frame, of a body, and a stream of something else."""
+    """Messages cut within a frame or body, and streams of another kind, are refused."""
     whole = encode_request(1.0, [b"abc"])
     with pytest.raises(LockstepError, match="closed within a message"):
         through_a_socket(whole[:-1])
@@ -89,7 +89,8 @@ def test_a_message_that_is_cut_or_no_message_is_refused():
 
 
 def served(answer):
-    """Address of a world that answers one request so, or closes where that is None."""
+    """Return the address of a world that gives this answer to one request, or closes the connection if it is
+    None."""
     server = socket.create_server(("127.0.0.1", 0))
 
     def serve():
@@ -104,14 +105,14 @@ def served(answer):
 
 
 def test_a_client_exchanges_with_a_world():
-    """It sends the time and its frames, and gets what reached it."""
+    """The client sends the time and its frames, and receives what the world delivers."""
     address = served(lambda until, sent: encode_delivery(Delivery(until, tuple((until, f) for f in sent))))
     with LockstepClient(address) as world:
         assert world.exchange(0.5, [b"x", b"yz"]) == Delivery(0.5, ((0.5, b"x"), (0.5, b"yz")))
 
 
 def test_a_world_that_is_not_there_gone_or_refuses_is_one_sentence():
-    """Each names the address or gives the world's own reason."""
+    """Each message names the address or gives the world's own reason."""
     with socket.create_server(("127.0.0.1", 0)) as closed:
         nobody = f"127.0.0.1:{closed.getsockname()[1]}"
     with pytest.raises(LockstepError, match="no world in lock-step at .* start one with"):
@@ -129,7 +130,7 @@ def test_a_world_that_is_not_there_gone_or_refuses_is_one_sentence():
 
 
 def test_a_silent_world_is_given_up():
-    """After the timeout, in one sentence."""
+    """A silent world is given up after the timeout, in one sentence."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         address = f"127.0.0.1:{server.getsockname()[1]}"
         with (

@@ -1,4 +1,4 @@
-"""From what sensors say to what a controller reads: in the right frames and times, whatever else arrives."""
+"""Perception turns sensor messages into the controller's reading, in the right frames and at the right times."""
 
 import math
 from dataclasses import replace
@@ -18,7 +18,8 @@ BAD = (math.nan, -math.inf, 3e38)
 
 
 def run(world, perception, duration, *, telemetry=lambda t, x: x, picture=lambda t, x: x, depart=0.0):
-    """Readings 60 times a second; telemetry at 100 Hz and pictures at 30 Hz, altered or dropped (None) on the way."""
+    """Return readings at 60 Hz from telemetry at 100 Hz and pictures at 30 Hz, altered or dropped (None) in
+    transit."""
     events = [(depart + 0.01 * k, 0, k) for k in range(round(100 * duration))]
     events += [(depart + k / 30 + world.pool.latency, 1, k) for k in range(round(30 * duration))]
     events += [(depart + k / 60 + 1e-6, 2, k) for k in range(round(60 * duration))]
@@ -34,7 +35,7 @@ def run(world, perception, duration, *, telemetry=lambda t, x: x, picture=lambda
 
 
 def errors(world, readings):
-    """Distance [m], turn [rad], velocity [m/s], rate [rad/s] from the truth, rms."""
+    """Return rms errors of distance [m], turn [rad], velocity [m/s] and rate [rad/s] against the truth."""
     found = [
         (
             np.linalg.norm(r.position - world.position(r.time)),
@@ -50,7 +51,8 @@ def errors(world, readings):
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", ["constant-velocity", "error-state"])
 def test_the_state_is_the_vehicles(mode):
-    """A moving, rocking vehicle seen 50 ms late is known to a centimetre and half a degree, and its speed to 3 cm/s."""
+    """The state of a moving, rocking vehicle seen 50 ms late is right to 1 cm and 0.5 degrees, its speed to 3
+    cm/s."""
     world = Rounds(overhead(latency=0.05), VEHICLE)
     readings = run(world, Perception(VEHICLE, world.pool, mode=mode), 4.0)[90:]
     assert all(r.ready and r.mode == "fresh" and r.reason == "" for r in readings)
@@ -58,7 +60,8 @@ def test_the_state_is_the_vehicles(mode):
 
 
 def test_the_world_frame_of_the_pool_file_is_that_of_the_reading():
-    """A pool surveyed in axes turned by 40° and moved: position, heading and velocity come out in world axes."""
+    """In a pool surveyed in axes rotated by 40° and shifted, position, heading and velocity are in world
+    axes."""
     turned = overhead(world_position=(0.1, -0.2, 0.0), world_orientation=tuple(quat_from_yaw(0.7).tolist()))
     world = Rounds(turned, VEHICLE)
     readings = run(world, Perception(VEHICLE, turned), 3.0)[90:]
@@ -67,7 +70,7 @@ def test_the_world_frame_of_the_pool_file_is_that_of_the_reading():
 
 
 def test_fixes_of_another_instrument_are_of_the_world_too():
-    """In the same turned pool, motion capture in place of the pictures: world axes in, world axes out."""
+    """In the same rotated pool, motion capture instead of pictures gives a reading in world axes as well."""
     turned = overhead(world_position=(0.1, -0.2, 0.0), world_orientation=tuple(quat_from_yaw(0.7).tolist()))
     world = Rounds(turned, VEHICLE)
     perception = Perception(VEHICLE, turned)
@@ -84,7 +87,8 @@ def test_fixes_of_another_instrument_are_of_the_world_too():
 
 
 def test_a_latency_that_the_pool_file_does_not_tell_shows():
-    """Pictures 0.1 s late taken for new ones put a vehicle at 0.09 m/s a centimetre behind; compensated, it is not."""
+    """Uncompensated pictures 0.1 s late put a vehicle at 0.09 m/s a centimetre behind; with compensation they
+    do not."""
     late = overhead(latency=0.1)
     world = Rounds(late, VEHICLE)
     told = errors(world, run(world, Perception(VEHICLE, late), 4.0)[90:])[0]
@@ -93,7 +97,7 @@ def test_a_latency_that_the_pool_file_does_not_tell_shows():
 
 
 def test_the_mcus_own_heading_does_not_enter():
-    """It points elsewhere and drifts by 10°/s; the heading is the camera's and the gyro's."""
+    """The mcu's heading is offset and drifts by 10°/s; the estimate uses the camera and the gyro."""
     pool = overhead()
     steady, drifting = (Rounds(pool, VEHICLE, mcu_yaw=y, drift=d) for y, d in ((0.0, 0.0), (2.0, 0.17)))
     a, b = (run(world, Perception(VEHICLE, pool), 2.0)[-1] for world in (steady, drifting))
@@ -101,7 +105,7 @@ def test_the_mcus_own_heading_does_not_enter():
 
 
 def test_before_the_first_fix_the_position_is_unknown_and_says_so():
-    """NaN, not ready, and why."""
+    """Before the first fix the position is NaN and the reading is not ready, with a reason."""
     world = Rounds(overhead(), VEHICLE)
     perception = Perception(VEHICLE, world.pool)
     assert perception.reading(0.0).reason == "no inertial data"
@@ -112,14 +116,14 @@ def test_before_the_first_fix_the_position_is_unknown_and_says_so():
 
 
 def test_without_a_camera_a_fix_is_what_is_missing():
-    """Nobody looks for a camera that there is not."""
+    """Without a camera the reason for not being ready names a missing fix, not a camera."""
     perception = Perception(VEHICLE, None)
     readings = run(Rounds(overhead(), VEHICLE), perception, 0.5, picture=lambda t, x: None)
     assert readings[-1].reason == "no position fix yet, and where it was let in is not given"
 
 
 def test_three_seconds_without_vision_end_readiness_and_it_comes_back():
-    """Coast, hold and lost in turn; ready again after the pictures are back."""
+    """The states are coast, hold and lost in turn; the reading is ready again once pictures return."""
     world = Rounds(overhead(), VEHICLE)
     readings = run(
         world, Perception(VEHICLE, world.pool), 7.0, picture=lambda t, x: None if 2.0 < t < 5.5 else x
@@ -132,7 +136,8 @@ def test_three_seconds_without_vision_end_readiness_and_it_comes_back():
 
 
 def test_a_clock_that_is_set_back_costs_a_moment():
-    """By a minute: not believed at first, ready again two seconds later, with the rates of now."""
+    """A clock set back by a minute is first rejected; two seconds later the reading is ready, with current
+    rates."""
     world = Rounds(overhead(), VEHICLE)
     perception = Perception(VEHICLE, world.pool)
     assert run(world, perception, 1.0, depart=100.0)[-1].ready
@@ -148,7 +153,7 @@ FIELDS = ["quaternion", "gyro", "accel", "depth", "pressure"]
 @pytest.mark.parametrize("field", FIELDS)
 @pytest.mark.parametrize("bad", BAD)
 def test_a_bad_number_in_telemetry_never_raises_and_never_gets_through(field, bad):
-    """While it lasts the reading is not ready or right; afterwards it is ready and right."""
+    """While it lasts the reading is either not ready or right; afterwards it is ready and right."""
     world = Rounds(overhead(), VEHICLE)
 
     def broken(t, telemetry):
@@ -165,7 +170,7 @@ def test_a_bad_number_in_telemetry_never_raises_and_never_gets_through(field, ba
 
 @pytest.mark.parametrize("bad", BAD)
 def test_bad_corners_never_raise_and_never_get_through(bad):
-    """One corner without a number: no fix from that tag, and the other one carries on."""
+    """A corner that is not a number gives no fix from that tag; the other tag still does."""
     world = Rounds(overhead(), VEHICLE)
 
     def broken(t, picture):
@@ -180,7 +185,8 @@ def test_bad_corners_never_raise_and_never_get_through(bad):
 
 
 def test_a_picture_that_is_none_is_counted():
-    """Colours, floats, another camera's, nothing at all, or a stamp that is no number."""
+    """Colours, floats, another camera's picture, nothing, or a stamp that is not a number count as invalid
+    pictures."""
     world = Rounds(overhead(), VEHICLE)
     perception = Perception(VEHICLE, world.pool)
     run(world, perception, 1.0)
@@ -201,7 +207,7 @@ def test_a_picture_that_is_none_is_counted():
 
 @pytest.mark.parametrize("what", ["gyro and accel", "depth", "picture"])
 def test_a_frozen_sensor_ends_readiness(what):
-    """One that repeats its last value with new stamps is not believed for longer than it takes to tell."""
+    """A sensor that repeats its last value with new stamps is trusted only until the freeze can be detected."""
     world = Rounds(overhead(), VEHICLE)
     last = {}
 
@@ -224,7 +230,7 @@ def test_a_frozen_sensor_ends_readiness(what):
 
 
 def test_telemetry_that_repeats_a_depth_adds_it_once():
-    """Of a 20 Hz sensor in 100 Hz telemetry, about twenty samples a second count."""
+    """A 20 Hz depth sensor in 100 Hz telemetry contributes about twenty samples a second."""
     world = Rounds(overhead(), VEHICLE)
     perception, held = Perception(VEHICLE, world.pool), {}
 
@@ -237,7 +243,8 @@ def test_telemetry_that_repeats_a_depth_adds_it_once():
 
 
 def test_without_a_filter_the_state_is_the_latest_fix():
-    """The ablation: position to centimetres, but a heading that drifts as the motor controller's own does."""
+    """Ablation without filter: the position is right to centimetres, but the heading drifts like the motor
+    controller's."""
     world = Rounds(overhead(), VEHICLE, drift=0.05)
     readings = run(world, Perception(VEHICLE, world.pool, fusion=False), 4.0)
     distance, turn, speed, _ = errors(world, readings[90:])
@@ -246,7 +253,7 @@ def test_without_a_filter_the_state_is_the_latest_fix():
 
 
 def test_what_cannot_be_is_refused():
-    """Method, mode and a vehicle without tags, in a sentence each."""
+    """An invalid method, an invalid mode and a vehicle without tags are each refused in one sentence."""
     pool = overhead()
     with pytest.raises(LocalizationError, match="unknown method 'x'"):
         Perception(VEHICLE, pool, method="x")
@@ -257,7 +264,8 @@ def test_what_cannot_be_is_refused():
 
 
 def test_the_gyros_bias_is_taken_off_about_the_vertical():
-    """A tilted vehicle turns at 0.3 rad/s about the vertical, and its gyro reads 0.05 rad/s too much there."""
+    """A tilted vehicle turns at 0.3 rad/s about the vertical while its gyro reads 0.05 rad/s too much about
+    that axis."""
     perception = Perception(VEHICLE, overhead())
     roll, pitch = 0.2, -0.3
     up = np.array([-np.sin(pitch), np.sin(roll) * np.cos(pitch), np.cos(roll) * np.cos(pitch)])

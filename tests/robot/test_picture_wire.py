@@ -1,4 +1,4 @@
-"""Pictures on their way to the robot: whole or not at all, from one peer, through the death of either side."""
+"""Pictures reach the robot whole or not at all, from one peer only, and either side may die."""
 
 import socket
 import time
@@ -34,7 +34,7 @@ TAGS = (
 
 
 def until(receive, count=1, patience=10.0):
-    """What has come when there are so many pictures."""
+    """Return what was received once it contains this many pictures."""
     found, end = [], time.monotonic() + patience
     while len(found) < count and time.monotonic() < end:
         found += receive(time.monotonic())
@@ -43,7 +43,7 @@ def until(receive, count=1, patience=10.0):
 
 
 def udp_pair(**options):
-    """A camera's and a robot's end on loopback."""
+    """Return a camera's and a robot's end on loopback."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
         camera = free.getsockname()
@@ -52,7 +52,7 @@ def udp_pair(**options):
 
 
 def test_a_picture_comes_back_from_its_bytes():
-    """Image and tags are the same to the bit, with the sender's word on its lateness."""
+    """Image and tags are bit-identical, and the lateness is the one that the sender reported."""
     posted = decode_picture(encode_picture(Picture(3.25, 7, NOISE, TAGS), late=0.5))
     assert (posted.picture.time, posted.picture.sequence, posted.late) == (3.25, 7, 0.5)
     assert np.array_equal(posted.picture.image, NOISE)
@@ -73,7 +73,7 @@ COLOURS = RANDOM.integers(0, 256, (9, 16, 3)).astype(np.uint8)
     ids=lambda reading: reading.source,
 )
 def test_readings_of_own_sensors_cross_udp_as_they_are(reading):
-    """Small pictures are not compressed: a policy sees the very numbers that it would see in training."""
+    """Small pictures are not compressed, so a policy receives exactly the same numbers as in training."""
     sender, robot = udp_pair()
     sender.send(reading, reading.time)
     (there,) = until(robot.receive)
@@ -84,7 +84,7 @@ def test_readings_of_own_sensors_cross_udp_as_they_are(reading):
 
 
 def test_a_large_picture_in_colour_is_compressed():
-    """JPEG keeps red red: within 12 levels of a smooth picture."""
+    """JPEG preserves colour: within 12 levels for a smooth picture."""
     image = np.zeros((40, 64, 3), np.uint8)
     image[..., 0], image[..., 2] = 200, np.arange(64)
     packed = encode_picture(Picture(0.0, 0, image, source="front_camera"), compress=True)
@@ -93,7 +93,7 @@ def test_a_large_picture_in_colour_is_compressed():
 
 
 def test_a_reading_needs_a_name_and_ranges_numbers():
-    """Whoever sends a name that no sensor can have, or NaN, sends nothing."""
+    """A reading with an invalid sensor name or with NaN is not sent."""
     for spoilt in (
         Picture(0.0, 0, COLOURS, source="Front camera"),
         Picture(0.0, 0, source="altimeter", ranges=np.array([np.nan], np.float32)),
@@ -102,7 +102,7 @@ def test_a_reading_needs_a_name_and_ranges_numbers():
 
 
 def test_pictures_are_resized_by_area():
-    """The mean of the pixels that each covers; another kind is refused."""
+    """Each resized pixel is the mean of the pixels that it covers; another kind is refused."""
     image = np.zeros((4, 8, 3), np.uint8)
     image[::2] = 100
     np.testing.assert_array_equal(resized(image, (2, 4, 3)), np.full((2, 4, 3), 50, np.uint8))
@@ -114,7 +114,8 @@ def test_pictures_are_resized_by_area():
 
 
 def test_a_sonars_picture_is_cut_to_the_range_that_is_seen():
-    """The nearest range cells of every beam as they are; other beams are refused, and too few cells."""
+    """The nearest range cells of every beam are kept unchanged; a different number of beams or too few cells
+    is refused."""
     echoes = np.arange(6 * 10, dtype=np.uint8).reshape(6, 10)
     np.testing.assert_array_equal(resized(echoes, (6, 4, 1))[..., 0], echoes[:, :4])
     for shape in ((3, 4, 1), (6, 11, 1), (6, 10, 3)):
@@ -123,7 +124,7 @@ def test_a_sonars_picture_is_cut_to_the_range_that_is_seen():
 
 
 def test_compression_takes_fewer_bytes_and_keeps_gray_to_a_few_levels():
-    """JPEG of a smooth picture: below half the bytes, within 4 levels."""
+    """JPEG of a smooth picture takes less than half the bytes and stays within 4 levels."""
     raw, packed = (encode_picture(Picture(0.0, 0, SMOOTH), compress=c) for c in (False, True))
     assert len(packed) < len(raw) / 2
     there = decode_picture(packed).picture.image.astype(int)
@@ -133,7 +134,7 @@ def test_compression_takes_fewer_bytes_and_keeps_gray_to_a_few_levels():
 @given(data=st.binary(max_size=300))
 @settings(max_examples=300, deadline=None)
 def test_bytes_at_random_are_no_picture(data):
-    """Neither codec nor assembler raises or makes a picture of noise."""
+    """Neither codec nor assembler raises on random bytes or makes a picture of them."""
     assert decode_picture(data) is None
     assert decode_picture(b"FSPC\x01\x02" + data) is None
     assert Assembler().add(data) is None or data[:4] == b"FSPF"
@@ -144,7 +145,7 @@ def test_bytes_at_random_are_no_picture(data):
 )
 @settings(max_examples=300, deadline=None)
 def test_a_spoilt_picture_raises_nothing(place, value, cut, packed):
-    """Any byte changed, any length cut: a picture with finite numbers comes out, or none."""
+    """With any byte changed or any length cut, the result is a picture with finite numbers or none."""
     data = bytearray(encode_picture(Picture(1.0, 1, SMOOTH, TAGS), compress=packed))
     data[place % len(data)] = value
     for spoilt in (bytes(data), bytes(data[: cut % len(data)])):
@@ -154,7 +155,7 @@ def test_a_spoilt_picture_raises_nothing(place, value, cut, packed):
 
 
 def test_fragments_find_together_in_any_order_and_not_without_each_other():
-    """Shuffled and doubled fragments make the message once; one that is missing or spoilt drops it."""
+    """Shuffled and duplicated fragments give the message once; a missing or corrupted fragment drops it."""
     data = bytes(RANDOM.integers(0, 256, 10_000, dtype=np.uint8))
     pieces = fragments(data, 5, 1400)
     assert len(pieces) == 8
@@ -170,7 +171,7 @@ def test_fragments_find_together_in_any_order_and_not_without_each_other():
 
 
 def test_unfinished_messages_take_bounded_memory():
-    """Of a hundred messages that never end, few are kept."""
+    """Only a few of a hundred unfinished messages are kept."""
     assembler, piece = Assembler(), bytes(50_000)
     for number in range(100):
         for datagram in fragments(piece * 30 + bytes([number]), number, 50_000)[:-1]:
@@ -181,7 +182,7 @@ def test_unfinished_messages_take_bounded_memory():
 
 @pytest.mark.parametrize("fragment", [1400, 60_000])
 def test_pictures_cross_udp(fragment):
-    """Image, tags and sequence arrive; the time is that of reception less the lateness."""
+    """Image, tags and sequence arrive; the time is the time of reception minus the lateness."""
     camera, robot = udp_pair(fragment=fragment)
     try:
         before = time.monotonic()
@@ -200,7 +201,7 @@ def test_tags_alone_fit_one_datagram():
 
 
 def test_others_are_refused_and_named_once(caplog):
-    """A stranger's picture is not taken, whatever it holds, and the log says once who it was."""
+    """A picture from an unknown sender is rejected whatever it contains, and the log names the sender once."""
     camera, robot = udp_pair()
     try:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
@@ -218,7 +219,7 @@ def test_others_are_refused_and_named_once(caplog):
 
 
 def test_a_source_is_opened_by_its_address():
-    """Each address opens its source; others are refused in one sentence."""
+    """Each address opens its source; any other is refused in one sentence."""
     assert isinstance(open_pictures("none"), NoPictures) and open_pictures("none").receive(0.0) == []
     source = open_pictures("udp://127.0.0.1:58767", "127.0.0.1:0")
     assert isinstance(source, UdpPictures) and source.peer == ("127.0.0.1", 58767)
@@ -230,7 +231,7 @@ def test_a_source_is_opened_by_its_address():
 
 @pytest.mark.parametrize("marker", [0xC4, 0xC8, 0xCC, 0xE0])
 def test_a_segment_before_the_frame_header_does_not_hide_the_size(marker):
-    """Huffman tables, extensions and the like may come before the frame header; none of them is taken for it."""
+    """Segments such as Huffman tables or extensions before the frame header are not mistaken for it."""
     data = bytearray(encode_picture(Picture(1.0, 0, SMOOTH), compress=True))
     start = data.index(b"\xff\xd8\xff")
     dqt = data.index(b"\xff\xdb", start)

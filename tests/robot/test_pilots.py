@@ -1,4 +1,4 @@
-"""Pilots decide what the same controller decides elsewhere, and refuse what does not fit."""
+"""Pilots decide exactly as the same controller does elsewhere, and refuse what does not fit."""
 
 import hashlib
 import math
@@ -56,7 +56,7 @@ def network():
 
 @pytest.fixture
 def policy(tmp_path):
-    """Writes a policy directory of T1 for FinsROV, with changes to its description."""
+    """Return a function that writes a T1 policy directory for FinsROV, with changes to its description."""
 
     def write(**changes):
         content = network()
@@ -82,7 +82,7 @@ def policy(tmp_path):
 
 
 def test_a_policy_pilot_gives_the_thrusts_of_its_network(policy):
-    """Observation, network, action mode and allocation in a row."""
+    """The pilot chains observation, network, action mode and allocation."""
     pilot = make_pilot(policy(), VEHICLE)
     action = np.clip(GAIN @ Observer("t1", VEHICLE).observe(READING, STATION, 0.0), -1.0, 1.0)
     expected = action_mode("wrench4", VEHICLE, 0.5).to_thrusters(action)
@@ -107,19 +107,19 @@ def test_a_policy_pilot_gives_the_thrusts_of_its_network(policy):
     ],
 )
 def test_a_policy_that_does_not_fit_is_refused(policy, changes, sentence):
-    """Vehicle, task, observation or limits: one sentence that names it."""
+    """A mismatch of vehicle, task, observation or limits is named in one sentence."""
     with pytest.raises((PolicyError, ControlError), match=sentence):
         make_pilot(policy(**changes), VEHICLE)
 
 
 def test_a_policy_of_another_task_than_asked_is_refused(policy):
-    """`--task t2` with a policy of T1."""
+    """`--task t2` with a policy of T1 is refused."""
     with pytest.raises(PolicyError, match="trained for task 't1', but this is 't2'"):
         make_pilot(policy(), VEHICLE, task="t2")
 
 
 def test_a_network_that_was_changed_is_refused(policy):
-    """Its hash is in the description."""
+    """A network whose hash differs from the description is refused."""
     folder = policy()
     (folder / "policy.onnx").write_bytes(b"x")
     with pytest.raises(PolicyError, match="corrupt"):
@@ -128,7 +128,7 @@ def test_a_network_that_was_changed_is_refused(policy):
 
 @pytest.mark.parametrize("name", ["pid", "pid-paper"])
 def test_a_pid_pilot_allocates_the_controllers_wrench(name):
-    """Two decisions in a row, with the memory between them; reset forgets it."""
+    """Memory is kept between two consecutive decisions; reset clears it."""
     pilot, same = make_pilot(name, VEHICLE), controller(name, VEHICLE)
     memory, limits, first = same.reset(), VEHICLE.wrench_limits, None
     for _ in range(2):
@@ -143,7 +143,7 @@ def test_a_pid_pilot_allocates_the_controllers_wrench(name):
 
 
 def test_a_wrench_pilot_gives_a_persons_wrench_within_the_limits():
-    """Surge that the thrusters can give comes out whole; a hundred times the limit comes out as the limit."""
+    """A feasible surge is passed unchanged; a hundred times the limit is clipped to the limit."""
     wanted = np.array([5.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     pilot = WrenchPilot(lambda: wanted, VEHICLE)
     blind = Reading(0.0, np.full(3, np.nan), np.full(4, np.nan), np.full(6, np.nan), False)
@@ -154,7 +154,8 @@ def test_a_wrench_pilot_gives_a_persons_wrench_within_the_limits():
 
 
 def test_a_mode_switch_is_the_pilot_that_is_selected():
-    """Its period, its need of a state and its decisions; a new one starts without memory."""
+    """Period, need of a state and decisions are those of the selected pilot; a newly selected pilot starts
+    without memory."""
     pilots = {"hold": make_pilot("pid", VEHICLE), "hand": WrenchPilot(lambda: np.zeros(6), VEHICLE)}
     switch = ModeSwitch(pilots)
     first = switch.act(READING, STATION, 0.0)
@@ -171,7 +172,7 @@ def test_a_mode_switch_is_the_pilot_that_is_selected():
 
 
 def test_who_is_neither_pid_nor_policy_is_refused():
-    """The sentence lists what there is."""
+    """The refusal lists the available controllers."""
     with pytest.raises(
         PolicyError, match="neither pid nor pid-paper nor lqr nor nmpc nor a policy directory"
     ):
@@ -179,7 +180,7 @@ def test_who_is_neither_pid_nor_policy_is_refused():
 
 
 class Watched:
-    """An agent that keeps what it sees."""
+    """An agent that records its readings."""
 
     def __init__(self, agent):
         self.agent, self.seen = agent, []
@@ -193,7 +194,7 @@ class Watched:
 
 
 def disturbed(**noise):
-    """A PID whose input is disturbed."""
+    """Return a PID with noise on its input."""
     pilot = make_pilot("pid", VEHICLE)
     pilot.agent = Watched(pilot.agent)
     pilot.disturb_input(**noise)
@@ -201,7 +202,7 @@ def disturbed(**noise):
 
 
 def test_noise_on_the_input_has_the_size_asked_for_and_touches_pose_alone():
-    """Over 2000 decisions: 5 cm on each axis, 10 degrees of heading, tilt and velocity untouched."""
+    """Over 2000 decisions: 5 cm on each axis and 10 degrees of heading; tilt and velocity are unchanged."""
     pilot = disturbed(position_std=0.05, yaw_std=math.radians(10.0), seed=3)
     for _ in range(2000):
         pilot.act(READING, STATION, 0.0)
@@ -216,7 +217,7 @@ def test_noise_on_the_input_has_the_size_asked_for_and_touches_pose_alone():
 
 
 def test_noise_on_the_input_repeats_from_its_seed():
-    """After a reset, and in another instance; another seed differs."""
+    """The noise repeats after a reset and in another instance; another seed differs."""
     a, b, c = (disturbed(position_std=0.05, yaw_std=0.1, seed=s) for s in (1, 1, 2))
     for pilot in (a, b, c):
         pilot.act(READING, STATION, 0.0)
@@ -229,21 +230,21 @@ def test_noise_on_the_input_repeats_from_its_seed():
 
 
 def test_turns_stay_on_the_grid_of_their_start():
-    """Late calls miss turns and shift none; a turn may come 2 ms early."""
+    """Late calls miss turns but shift none; a turn may come 2 ms early."""
     ticks = Ticks(10.0)
     due = [ticks.due(t, 0.1) for t in (10.0, 10.05, 10.099, 10.15, 10.23, 10.55, 10.6)]
     assert due == [(True, 0), (False, 0), (True, 0), (False, 0), (True, 0), (True, 2), (True, 0)]
 
 
 def test_turns_go_on_after_the_clock_was_set_back():
-    """From then on at once and on a new grid."""
+    """After the clock is set back, turns continue at once on a new grid."""
     ticks = Ticks(10.0)
     assert ticks.due(10.0, 0.1) == (True, 0)
     assert [ticks.due(t, 0.1) for t in (3.0, 3.05, 3.1)] == [(True, 0), (False, 0), (True, 0)]
 
 
 def test_goals_are_read_from_text_and_files(tmp_path):
-    """x, y, z [m] and degrees."""
+    """Goals are x, y, z [m] and degrees."""
     assert station_of("1,-0.3,-0.5,90") == Station((1.0, -0.3, -0.5), math.radians(90.0))
     file = tmp_path / "goal.yaml"
     file.write_text("goal: [0.5, 0, -0.4, -45]\n")
@@ -253,13 +254,13 @@ def test_goals_are_read_from_text_and_files(tmp_path):
 
 @pytest.mark.parametrize("text", ["1,2,3", "1,2,3,x", "nan,0,0,0", ""])
 def test_a_goal_that_is_none_is_refused(text):
-    """What was expected, with units."""
+    """The refusal states what was expected, with units."""
     with pytest.raises(GoalError, match="expected four numbers x,y,z,yaw_deg"):
         station_of(text)
 
 
 def test_a_goal_file_without_a_goal_is_refused(tmp_path):
-    """And one that is no YAML."""
+    """A file without a goal and a file that is not YAML are refused."""
     (tmp_path / "a.yaml").write_text("x: 1\n")
     (tmp_path / "b.yaml").write_text("goal: [1, 2\n")
     with pytest.raises(GoalError, match="no goal in it"):
@@ -269,14 +270,14 @@ def test_a_goal_file_without_a_goal_is_refused(tmp_path):
 
 
 def test_one_of_goal_and_trajectory_must_be_given():
-    """Not both, not neither."""
+    """Giving both or neither is refused."""
     for both in (("0,0,-0.5,0", "ellipse"), (None, None)):
         with pytest.raises(GoalError, match="either a goal"):
             guide_of(*both)
 
 
 def test_a_goal_outside_the_workspace_is_refused():
-    """Above the water, or beyond a wall; the published trajectories are inside."""
+    """Goals above the water or beyond a wall are refused; the published trajectories lie inside."""
     check_reachable(guide_of(None, "ellipse"), VEHICLE)
     with pytest.raises(GoalError, match="outside the workspace"):
         check_reachable(station_of("2.5,0,-0.5,0"), VEHICLE)
@@ -287,7 +288,8 @@ def test_a_goal_outside_the_workspace_is_refused():
 
 
 def test_a_way_that_is_faster_than_the_vehicle_is_refused():
-    """Between any two of its points, however short that is; a vehicle that cannot go sideways follows a curve."""
+    """The speed is checked between any two points, however close; a vehicle that cannot sway still follows a
+    curve."""
     way = [
         (0.0, 0.0, 0.0, -0.5),
         (500.0, 0.5, 0.0, -0.5),
@@ -301,14 +303,14 @@ def test_a_way_that_is_faster_than_the_vehicle_is_refused():
 
 
 def test_the_published_pid_has_a_profile_for_each_task():
-    """Stations are kept with one set of gains, trajectories followed with another."""
+    """Station keeping uses one set of gains, trajectory following another."""
     t1, t2 = (make_pilot("pid-paper", VEHICLE, task=task).act(READING, STATION, 0.0) for task in ("t1", "t2"))
     assert np.abs(t1 - t2).max() > 0.1
 
 
 @pytest.mark.parametrize(("left", "up"), [(1.0, 0.0), (-0.5, 0.0), (0.0, 1.0), (0.5, -0.5)])
 def test_a_person_moves_fins_by_their_effect(left, up):
-    """Left turns to port and up raises the bow; the propeller follows the forward stick, and nothing else does."""
+    """Left turns to port and up raises the bow; only the forward stick drives the propeller."""
     vehicle = load_vehicle("remus100")
     pilot = HelmPilot(lambda: (0.5, 0.0, up, left), vehicle)
     channels = pilot.act(LEVEL, Station((0.0, 0.0, 0.0), 0.0), 0.0)
@@ -323,7 +325,7 @@ def test_a_person_moves_fins_by_their_effect(left, up):
 
 
 def test_a_person_gives_orders_to_the_autopilot():
-    """The same channels as the action of mode `course_pitch`; without forward everything stands still."""
+    """The channels equal the action of mode `course_pitch`; without forward everything stops."""
     vehicle, hands = load_vehicle("remus100"), [0.75, 0.0, 0.2, -0.4]
     pilot = HelmPilot(lambda: hands, vehicle, "course_pitch", period=0.1)
     assert pilot.needs_state

@@ -1,4 +1,5 @@
-"""The outermost loop: deadlines from the start, overruns counted, thrusters stopped however it ends."""
+"""The outermost loop: deadlines count from the start, overruns are counted, and thrusters stop however the
+loop ends."""
 
 import gc
 import os
@@ -26,7 +27,7 @@ POOL = overhead()
 
 
 class Acted:
-    """Clock, wire and camera of a vehicle on its rounds, in a time that `wait` makes pass."""
+    """Simulated clock, wire and camera of a vehicle on its rounds; `wait` advances the time."""
 
     def __init__(self):
         self.now, self.rounds = 100.0, Rounds(POOL, VEHICLE)
@@ -83,7 +84,8 @@ def test_it_steps_at_its_rate_arms_and_ends_with_frames_without_thrust():
 
 @pytest.mark.slow
 def test_a_late_step_is_an_overrun_and_shifts_no_deadline():
-    """One step of 55 ms loses two deadlines; the next is made at once, the others stay multiples of the period."""
+    """A step of 55 ms misses two deadlines; the next step follows at once, and later ones stay multiples of
+    the period."""
     world, times = Acted(), []
 
     def show(runtime):
@@ -103,7 +105,8 @@ def test_a_late_step_is_an_overrun_and_shifts_no_deadline():
 
 @pytest.mark.slow
 def test_what_was_decided_before_a_standstill_is_not_sent_after_it():
-    """Stopped for 9 s within a step, as by SIGSTOP: on waking no frame turns a thruster, and the run is in fault."""
+    """After 9 s of standstill within a step, as by SIGSTOP, no frame turns a thruster and the run is in
+    fault."""
     world, enabled, said = Acted(), {}, []
     runtime = world.runtime()
     step = runtime.step
@@ -125,7 +128,7 @@ def test_what_was_decided_before_a_standstill_is_not_sent_after_it():
 
 @pytest.mark.slow
 def test_until_ends_the_run():
-    """After the tenth step."""
+    """`until` ends the run after the tenth step."""
     world = Acted()
     runtime = world.runtime()
     world.run(runtime, until=lambda r: r.counters.steps == 10)
@@ -135,7 +138,7 @@ def test_until_ends_the_run():
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_the_run_between_two_steps(number):
-    """Disarmed, zero frames sent, and the handlers as before, the garbage collector too."""
+    """The run is disarmed with zero frames; signal handlers and garbage collector are restored."""
     world, before = Acted(), signal.getsignal(number)
 
     def show(runtime):
@@ -151,7 +154,7 @@ def test_a_signal_ends_the_run_between_two_steps(number):
 
 @pytest.mark.slow
 def test_thrusters_stop_even_where_the_loop_breaks():
-    """An error of the program's own still sends frames without thrust."""
+    """An error in the program itself still sends frames without thrust."""
     world = Acted()
 
     def show(runtime):
@@ -165,7 +168,7 @@ def test_thrusters_stop_even_where_the_loop_breaks():
 
 
 def test_tags_are_found_beside_the_loop():
-    """A thread takes rendered pictures and hands over their tags; a blank one comes out as nothing seen."""
+    """A thread finds the tags of rendered pictures; a blank picture yields no tags."""
     corners = {tag: pose_corners(60.0, centre=(80.0 + 9 * tag, 70.0 * (tag - 14))) for tag in (15, 16)}
     image = draw((240, 400), corners, family=VEHICLE.tags.family)
     found, come = [], threading.Event()
@@ -193,7 +196,7 @@ def test_tags_are_found_beside_the_loop():
 
 
 def test_a_picture_that_the_detector_chokes_on_is_one_without_tags(caplog):
-    """Told once; the finder lives on, and closes."""
+    """The error is logged once; the finder keeps running and closes."""
     image = np.zeros((20, 20), np.uint8)
 
     class Source:

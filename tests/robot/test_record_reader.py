@@ -1,4 +1,4 @@
-"""Records are read whether finished, cut or damaged, and repaired into files that every reader takes."""
+"""Finished, cut and damaged records are read, and repaired into files that every reader accepts."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ LEVEL = (0.0, 0.0, 0.0, 1.0)
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """Four seconds of telemetry on a clock that begins in 2023, in eight chunks or more."""
+    """Four seconds of telemetry on a clock that begins in 2023, in at least eight chunks."""
     path = tmp_path_factory.mktemp("record") / "run.mcap"
     with Recorder(path, VEHICLE, {"seed": 5}, epoch=1.7e9) as recorder:
         for i in range(400):
@@ -38,7 +38,7 @@ def depths(path):
 
 
 def test_times_are_of_the_robots_clock(run):
-    """The epoch is taken off again; `start` passes over what is earlier."""
+    """The epoch is subtracted again; `start` skips earlier messages."""
     with open_record(run) as record:
         times = [entry.time for entry in record.messages(["telemetry"])]
         later = [entry.time for entry in record.messages(["/finsrov/telemetry"], start=13.0)]
@@ -55,7 +55,7 @@ def test_an_unknown_topic_is_refused_with_those_there_are(run):
 
 @pytest.mark.parametrize("part", [0.2, 0.35, 0.6, 0.95, 0.999])
 def test_a_cut_anywhere_leaves_what_is_before_it(run, tmp_path, part):
-    """Of a file cut to a part of its length, the messages that are left are its first ones, unchanged."""
+    """A file cut to a part of its length yields its first messages, unchanged."""
     cut = tmp_path / "cut.mcap"
     whole = run.read_bytes()
     cut.write_bytes(whole[: int(part * len(whole))])
@@ -67,7 +67,7 @@ def test_a_cut_anywhere_leaves_what_is_before_it(run, tmp_path, part):
 
 
 def test_a_repaired_record_is_whole(run, tmp_path):
-    """It has a summary, opens in rosbags, and holds the metadata and files; the cut one stays as it was."""
+    """It has a summary, opens in rosbags, and contains metadata and files; the cut record is unchanged."""
     cut, mended = tmp_path / "cut.mcap", tmp_path / "mended.mcap"
     cut.write_bytes(run.read_bytes()[:-3000])
     before = cut.read_bytes()
@@ -82,7 +82,7 @@ def test_a_repaired_record_is_whole(run, tmp_path):
 
 
 def chunks(path):
-    """Where the chunks begin, and their lengths."""
+    """Return start and length of each chunk."""
     with path.open("rb") as file:
         found = make_reader(file).get_summary().chunk_indexes
     return [(chunk.chunk_start_offset, chunk.chunk_length) for chunk in found]
@@ -91,7 +91,7 @@ def chunks(path):
 @pytest.mark.parametrize("number", [0, 4])
 @pytest.mark.parametrize("at", ["data", "length", "kind"])
 def test_a_flipped_bit_costs_its_chunk_alone(run, tmp_path, number, at):
-    """Whatever of a chunk it breaks, the messages of all others are read, and a sentence says what is missing."""
+    """The messages of all other chunks are read, and a sentence states what is missing."""
     damaged, mended = tmp_path / "damaged.mcap", tmp_path / "mended.mcap"
     data, places = bytearray(run.read_bytes()), chunks(run)
     begin, length = places[number]
@@ -117,7 +117,7 @@ def test_a_broken_index_costs_nothing(run, tmp_path):
 
 
 def test_a_record_without_its_header_is_read(run, tmp_path):
-    """Its first record is another one: the copy with an index is a file all the same."""
+    """If the first record is not a header, the repaired copy still has one and an index."""
     damaged, data = tmp_path / "damaged.mcap", bytearray(run.read_bytes())
     data[8] ^= 0x40  # the kind of the header
     data[-100] ^= 0x10
@@ -126,7 +126,7 @@ def test_a_record_without_its_header_is_read(run, tmp_path):
 
 
 def test_a_file_that_ends_between_two_records_is_cut(run, tmp_path):
-    """Nothing in it is broken; its end is missing."""
+    """Such a file is intact except for its missing end."""
     cut, data, at = tmp_path / "cut.mcap", run.read_bytes(), 8
     while at < run.stat().st_size // 2:
         at += 9 + int.from_bytes(data[at + 1 : at + 9], "little")
@@ -137,7 +137,8 @@ def test_a_file_that_ends_between_two_records_is_cut(run, tmp_path):
 
 @pytest.mark.parametrize("repeated", [True, False])
 def test_a_channel_without_a_schema_and_a_summary_without_schemas_are_read(tmp_path, capsys, repeated):
-    """A file of another program: JSON without a schema beside a topic of a known type, its schemas only in the data."""
+    """JSON without a schema next to a topic of a known type, with schemas only in the data, as another
+    program writes."""
     path, text = tmp_path / "other.mcap", "builtin_interfaces/msg/Time"
     with path.open("wb") as file:
         writer = Writer(file, repeat_schemas=repeated)

@@ -1,4 +1,4 @@
-"""`finssim record` and `finssim play`: figures of a record, and its messages."""
+"""`finssim record` and `finssim play` print figures and messages of a record."""
 
 import json
 
@@ -35,7 +35,7 @@ def run(tmp_path_factory):
 
 
 def finssim(capsys, *words):
-    """Standard output of a command that succeeds."""
+    """Return the standard output of a command that succeeds."""
     assert boundary.run(app, [str(word) for word in words]) == 0
     return capsys.readouterr().out
 

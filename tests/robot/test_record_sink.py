@@ -1,4 +1,4 @@
-"""What is on disk when the recording process dies or the disk is full."""
+"""Data on disk after the recording process dies or the disk is full."""
 
 import os
 import signal
@@ -39,14 +39,15 @@ print("problem", recorder.problem, recorder.dropped > 0)
 
 
 def recording(path, *, before=""):
-    """A process that records a hundred telemetries a second and prints the time of each."""
+    """Start a process that records a hundred telemetries a second and prints the time of each."""
     script = textwrap.dedent(before) + RECORD
     return subprocess.Popen([sys.executable, "-c", script, str(path)], stdout=subprocess.PIPE, text=True)
 
 
 @pytest.mark.slow
 def test_kill_9_loses_less_than_the_last_second(tmp_path):
-    """The process is killed after two seconds of recording; all but the last second of it is read."""
+    """After two seconds of recording the process is killed; everything but at most its last second can be
+    read."""
     path = tmp_path / "run.mcap"
     with recording(path) as process:
         told = [0.0]
@@ -63,7 +64,7 @@ def test_kill_9_loses_less_than_the_last_second(tmp_path):
 
 @pytest.mark.slow
 def test_a_full_disk_stops_the_record_and_not_the_loop(tmp_path):
-    """At a limit on the file's size recording stops with a sentence; the file is readable, the loop goes on."""
+    """At a limit on file size recording stops with a message; the file is readable and the loop continues."""
     path = tmp_path / "run.mcap"
     limit = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000))\n"
     with recording(path, before=limit) as process:

@@ -1,4 +1,4 @@
-"""The record: what was put in comes out, in any reader; what is written stays readable when the process dies."""
+"""Any reader returns what was recorded; written data remain readable when the process dies."""
 
 import json
 import shutil
@@ -61,7 +61,7 @@ def reading(t, *, x=0.0):
 
 
 def messages(path):
-    """Topic -> its messages with their times [ns]."""
+    """Return messages with their times [ns] by topic."""
     found = {}
     with AnyReader([path]) as reader:
         for connection, time, raw in reader.messages():
@@ -122,7 +122,8 @@ def test_rosbags_reads_back_what_the_robot_knew(full):
 
 
 def test_channels_offer_the_quality_of_their_topics(full):
-    """As rosbag2 keeps it: rosbags' own reader of that YAML takes it, in the form of Humble, which Jazzy reads too."""
+    """The quality of service is as rosbag2 stores it: rosbags' own reader accepts the Humble form, which
+    Jazzy reads too."""
     with full.open("rb") as file:
         channels = make_reader(file).get_summary().channels.values()
     keys = {topic.under("finsrov"): key for key, topic in TOPICS.items()}
@@ -161,7 +162,8 @@ def test_rosbags_reads_back_what_the_robot_did(full):
 
 
 def test_rosbags_reads_back_what_navigation_instruments_said(full):
-    """At the time of the measurement, in map, log and body; what is not measured is as uncertain as can be."""
+    """Messages carry the time of measurement in map, log and body; unmeasured values have the largest
+    uncertainty."""
     found = messages(full)
     (_, fix), (time, pose) = found["/finsrov/positioning/pose"]  # an unknown kind makes no message
     assert time == 1_700_000_000_106_000_000
@@ -204,7 +206,8 @@ def test_the_mcap_library_finds_summary_metadata_and_vehicle_file(full):
 
 
 def test_a_record_keeps_the_files_that_its_vehicle_extends(tmp_path):
-    """Without the folder in which they were, with a parent beside the file and one in the catalogue."""
+    """The record includes a parent beside the file and one in the catalogue, and is read without their
+    folder."""
     (tmp_path / "own").mkdir()
     (tmp_path / "own" / "otter.yaml").write_text(
         "extends: finsrov\nbody: {mass: 12.4}\norigin: guessed\nsource: me\n"
@@ -238,7 +241,7 @@ def test_a_parent_that_a_record_keeps_may_not_name_a_path(tmp_path):
     ("count", "kept"), [(7, 7), (2**32 - 1, 2**32 - 1), (2**32, 2**32 - 1), (10**30, 2**32 - 1)]
 )
 def test_counts_and_times_beyond_their_fields_are_the_last_that_fit(count, kept):
-    """A uint32 ends at 2³² - 1, the seconds of a time at ±2³¹: beyond them the serialiser would raise."""
+    """Beyond the ends of uint32 (2³² - 1) and of the seconds of a time (±2³¹) the serialiser would raise."""
     messages = Messages(VEHICLE)
     policy = messages.policy(10**9 * count, "pid", {"missed": count})
     state = messages.estimator(0, reading(0.0), {"fixes_accepted": count, "fixes_rejected": count})
@@ -266,7 +269,7 @@ def test_an_existing_record_is_never_replaced(tmp_path):
 
 
 def test_the_imu_message_agrees_with_the_mount():
-    """Attitude of the body is the IMU's times the inverse of its mount, for a vehicle with any mount."""
+    """The attitude of the body is that of the IMU times the inverse of its mount, for any mount."""
     mount = quat_from_euler(0.3, -0.4, 1.0)
     imu = VEHICLE.sensors.imu.model_copy(update={"orientation": tuple(mount)})
     turned = VEHICLE.model_copy(update={"sensors": VEHICLE.sensors.model_copy(update={"imu": imu})})
@@ -281,7 +284,7 @@ def test_the_imu_message_agrees_with_the_mount():
 
 
 def test_a_vehicle_changed_by_a_program_is_kept_as_it_is(tmp_path):
-    """Its file would tell another mass."""
+    """The stored mass is that of the changed vehicle, not that of its file."""
     with Recorder(tmp_path / "run.mcap", VEHICLE.replace({"body.mass": 13.0})):
         pass
     with open_record(tmp_path / "run.mcap") as record:
@@ -289,7 +292,8 @@ def test_a_vehicle_changed_by_a_program_is_kept_as_it_is(tmp_path):
 
 
 def test_own_sensors_are_in_the_record(tmp_path):
-    """Pictures as JPEG with their lens, pings with a fan to look at, ranges; stamped with their exposures."""
+    """Pictures are stored as JPEG with their lens, pings with a fan view, and ranges; stamps are those of
+    exposure."""
     path, image = tmp_path / "run.mcap", np.zeros((36, 64, 3), np.uint8)
     image[..., 0] = 200
     echoes = np.zeros((128, 128), np.uint8)
@@ -316,7 +320,7 @@ def test_own_sensors_are_in_the_record(tmp_path):
 
 
 def test_shaft_speeds_need_the_output_of_every_thruster():
-    """Speeds of all outputs give all thrusters in their order; one output short gives no message."""
+    """Speeds of all outputs give all thrusters in their order; with one output missing there is no message."""
     messages = Messages(VEHICLE)
     message = messages.shafts(0, RPM)
     assert list(message.name) == list(VEHICLE.thruster_names) and len(message.velocity) == 8
@@ -326,7 +330,7 @@ def test_shaft_speeds_need_the_output_of_every_thruster():
 
 
 def test_actuators_besides_thrusters_are_joints(tmp_path):
-    """Values as measured at their stamp, and as requested; `record info` lists both topics."""
+    """Measured values carry their stamps beside the requested ones; `record info` lists both topics."""
     ours = torpedo()
     with Recorder(tmp_path / "run.mcap", ours) as recorder:
         snapshot = Telemetry(1, 10, (0.0, 0.0, 0.0, 1.0), (0.1,) * 3, (0.0, 0.0, 9.8), 1.0, 1e5, 7, (60.0,))

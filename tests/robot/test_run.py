@@ -1,4 +1,4 @@
-"""`finssim run`, as a person types it: against a world in lock-step and on a wire with nobody at its end."""
+"""`finssim run` from the command line: against a lock-step world and on a wire without a peer."""
 
 import json
 import socket
@@ -28,13 +28,13 @@ VEHICLE = without_latency(load_vehicle("finsrov"))
 
 @pytest.fixture
 def pool_file(tmp_path):
-    """Of the camera that sees the rounds."""
+    """Pool file of the camera that sees the rounds."""
     write_pool(POOL, tmp_path / "pool.yaml")
     return tmp_path / "pool.yaml"
 
 
 class Served:
-    """A vehicle on its rounds, in lock-step over TCP; keeps the commands it hears."""
+    """A vehicle on its rounds, in lock-step over TCP; keeps the commands that it receives."""
 
     def __init__(self, telemetry_ends=1e9):
         self.commands, self._ends = [], telemetry_ends
@@ -71,13 +71,13 @@ def finssim(*words):
 
 
 def told(capsys, *words):
-    """What `--json` prints."""
+    """Return the output of `--json`."""
     status = finssim(*words, "--json")
     return status, json.loads(capsys.readouterr().out)
 
 
 def test_an_armed_run_in_lockstep_commands_records_and_tells(capsys, tmp_path, pool_file):
-    """Armed, every decision made, the thrusters disabled at the end, and a record that opens."""
+    """The run arms, makes every decision, disables the thrusters at the end, and writes a record that opens."""
     world, record = Served(), tmp_path / "run.mcap"
     words = ("--policy", "pid", "--goal", "0.5,0.2,-0.5,30", "--pool-file", pool_file, "--lockstep")
     status, summary = told(
@@ -103,7 +103,7 @@ def test_a_run_that_is_not_armed_says_so_and_turns_nothing(capsys, pool_file):
 
 
 def test_a_run_that_ends_in_a_fault_tells_why_with_status_3(capsys, pool_file):
-    """Telemetry ends at 2 s: fault within a second, and the run is over."""
+    """Telemetry ends at 2 s: a fault follows within a second and ends the run."""
     world = Served(telemetry_ends=2.0)
     words = ("--policy", "pid", "--goal", "0.5,0.2,-0.5,30", "--pool-file", pool_file, "--lockstep", "--arm")
     status, summary = told(capsys, *words, "--robot", world.address, "--duration", 60)
@@ -113,7 +113,7 @@ def test_a_run_that_ends_in_a_fault_tells_why_with_status_3(capsys, pool_file):
 
 
 def test_the_error_state_estimator_can_be_chosen(capsys, pool_file):
-    """And an unknown one is refused before anything starts."""
+    """An unknown estimator is refused before anything starts."""
     world = Served()
     words = ("--policy", "pid", "--goal", "0.5,0.2,-0.5,30", "--pool-file", pool_file, "--lockstep")
     status, summary = told(
@@ -126,7 +126,8 @@ def test_the_error_state_estimator_can_be_chosen(capsys, pool_file):
 
 @pytest.mark.slow
 def test_dead_reckoning_begins_where_the_vehicle_was_let_in(capsys, tmp_path):
-    """Log, compass, gauge and IMU in open water: without the place it is never armed, with it goes where it should."""
+    """In open water with log, compass, gauge and IMU the run arms only if the start is given, and then
+    reaches its goal."""
     heavy, truth = load_vehicle("bluerov2_heavy"), tmp_path / "truth"
     words = ("--policy", "pid", "--vehicle", "bluerov2_heavy", "--site", "open-water", "--pool-file", "none")
     words += ("--goal", "3.6,-2,-5,0", "--lockstep", "--arm")
@@ -145,12 +146,13 @@ def test_dead_reckoning_begins_where_the_vehicle_was_let_in(capsys, tmp_path):
 
 @pytest.mark.slow
 def test_a_policy_runs_where_the_vehicle_is_equipped_otherwise(capsys, tmp_path):
-    """Open water has another workspace, a log and a compass; policy and record stay those of the vehicle's file."""
+    """In open water with another workspace, a log and a compass, policy and record remain those of the
+    vehicle's file."""
     policy = written(linear(np.zeros((6, 16), np.float32)), tmp_path / "policy", task_named("t1"), 6)
     words = ("--policy", str(policy), "--goal", "0,0,-5,0", "--pool-file", "none", "--site", "open-water")
     ends = ("--robot", "udp://127.0.0.1:9", "--bind", "127.0.0.1:0", "--duration", "0.5")
     record = tmp_path / "run.mcap"
-    assert boundary.run(app, ["run", *words, *ends, "--record", str(record)]) == 4  # nobody is there
+    assert boundary.run(app, ["run", *words, *ends, "--record", str(record)]) == 4  # no peer is present
     capsys.readouterr()
     with open_record(record) as opened:
         assert opened.metadata["vehicle_sha256"] == load_vehicle("finsrov").sha256
@@ -158,7 +160,7 @@ def test_a_policy_runs_where_the_vehicle_is_equipped_otherwise(capsys, tmp_path)
 
 
 def test_without_a_pool_file_it_says_where_one_comes_from(capsys, tmp_path, monkeypatch):
-    """The default is looked for in this folder; what was named is another matter."""
+    """The default file is looked up in the current folder; a missing named file gives another message."""
     monkeypatch.chdir(tmp_path)
     assert finssim("--policy", "pid", "--goal", "0,0,-0.5,0") == 2
     assert "there is no pool.yaml in this folder: name the pool file" in capsys.readouterr().err
@@ -167,7 +169,8 @@ def test_without_a_pool_file_it_says_where_one_comes_from(capsys, tmp_path, monk
 
 
 def test_what_became_part_of_the_state_is_named_by_what_came():
-    """Pictures where there is a camera; fixes, velocities and headings where a site has these."""
+    """Sources of the state are pictures if there is a camera, and fixes, velocities and headings if the site
+    has them."""
     seen = {"fixes": 7, "pictures": 9, "samples": {"vision": {"accepted": 7, "gated": 2}, "velocity": {}}}
     assert _used(seen) == {"pictures used": "7 of 9"}
     verdicts = {"vision": {"initialized": 1, "accepted": 4, "late": 1}, "velocity": {"accepted": 3}}
@@ -179,7 +182,7 @@ def test_what_became_part_of_the_state_is_named_by_what_came():
 
 
 def test_a_trajectory_can_be_followed_in_place_of_a_goal(capsys, pool_file):
-    """By name; the goal moves with the time since the start."""
+    """A trajectory is chosen by name; its goal moves with the time since the start."""
     world = Served()
     words = ("--policy", "pid", "--trajectory", "straight", "--pool-file", pool_file, "--lockstep")
     status, summary = told(capsys, *words, "--robot", world.address, "--duration", 2, "--vehicle", "finsrov")
@@ -188,7 +191,8 @@ def test_a_trajectory_can_be_followed_in_place_of_a_goal(capsys, pool_file):
 
 @pytest.mark.slow
 def test_changes_are_followed_while_it_runs(capsys, tmp_path):
-    """A window of 10 s is fitted beside the run, and the vehicle is written; unarmed, nothing is."""
+    """A window of 10 s is fitted during the run and the vehicle file is written; an unarmed run writes
+    nothing."""
     pool, now = tmp_path / "pool.yaml", tmp_path / "now.yaml"
     words = (
         "--policy",
@@ -213,7 +217,7 @@ def test_changes_are_followed_while_it_runs(capsys, tmp_path):
 
 @pytest.mark.slow
 def test_on_a_wire_with_nobody_at_its_end_nothing_is_armed(capsys, pool_file):
-    """In real time, over UDP, without a camera: disarmed, and why."""
+    """In real time over UDP without a camera the run stays disarmed and gives the reason."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
         one.bind(("127.0.0.1", 0))
         free = f"127.0.0.1:{one.getsockname()[1]}"
@@ -227,7 +231,7 @@ def test_on_a_wire_with_nobody_at_its_end_nothing_is_armed(capsys, pool_file):
 
 @pytest.mark.slow
 def test_a_vehicle_that_says_nothing_is_told_of(capsys, pool_file):
-    """Once, after three seconds."""
+    """Silence of the vehicle is reported once, after three seconds."""
     words = ("--policy", "pid", "--goal", "0.5,0.2,-0.5,30", "--pool-file", pool_file, "--pictures", "none")
     assert finssim(*words, "--robot", "udp://127.0.0.1:9", "--bind", "127.0.0.1:0", "--duration", 3.5) == 4
     assert capsys.readouterr().err.count("no telemetry from udp://127.0.0.1:9") == 1
@@ -235,7 +239,7 @@ def test_a_vehicle_that_says_nothing_is_told_of(capsys, pool_file):
 
 @pytest.mark.slow
 def test_a_duration_of_zero_is_no_time_and_not_for_ever(capsys, pool_file):
-    """Nothing but the frames of the end goes out."""
+    """A duration of zero sends only the frames of the end."""
     words = ("--policy", "pid", "--goal", "0.5,0.2,-0.5,30", "--pool-file", pool_file, "--pictures", "none")
     status, summary = told(
         capsys, *words, "--robot", "udp://127.0.0.1:9", "--bind", "127.0.0.1:0", "--duration", 0, "--arm"
@@ -244,7 +248,7 @@ def test_a_duration_of_zero_is_no_time_and_not_for_ever(capsys, pool_file):
 
 
 def test_no_record_is_left_of_a_run_that_could_not_be_connected(capsys, tmp_path, pool_file):
-    """And one that is there is not touched."""
+    """A failed connection leaves no new record and does not touch an existing one."""
     words = ("--policy", "pid", "--goal", "0,0,-0.5,0", "--pool-file", pool_file, "--bind", "127.0.0.1:0")
     record = tmp_path / "run.mcap"
     assert finssim(*words, "--pictures", "eyes", "--record", record) == 2
@@ -274,6 +278,6 @@ def test_no_record_is_left_of_a_run_that_could_not_be_connected(capsys, tmp_path
     ],
 )
 def test_what_cannot_be_run_is_refused_in_a_sentence(capsys, pool_file, words, sentence):
-    """Status 2, before anything is sent."""
+    """The command ends with status 2 before anything is sent."""
     assert finssim(*words, "--pool-file", pool_file) == 2
     assert sentence in capsys.readouterr().err

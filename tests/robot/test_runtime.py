@@ -1,4 +1,4 @@
-"""One turn of the loop after the other: decides on its grid, arms once, stops when the pilot fails."""
+"""The loop decides on its grid, arms once, and stops when the pilot fails."""
 
 import math
 import signal
@@ -25,7 +25,7 @@ STATION = Station((0.5, 0.2, -0.5), 0.3)
 
 
 class Shown:
-    """A world that shows a vehicle on its rounds, whatever it is told; keeps what it is told."""
+    """A world with a vehicle on its rounds that ignores commands but keeps them."""
 
     def __init__(self, *, telemetry=lambda t: True, pictures=lambda t: True, **options):
         self.rounds, self.sent = Rounds(POOL, VEHICLE, **options), []
@@ -47,13 +47,13 @@ class Shown:
         return Delivery(until, tuple(frames), tuple(pictures))
 
     def commands(self):
-        """Time and command of each frame that was sent."""
+        """Return time and command of each frame that was sent."""
         decoder = Decoder(MCU)
         return [(t, command) for t, frame in self.sent for command in decoder.feed(frame)]
 
 
 class Constant:
-    """Always wants the same."""
+    """A pilot with a constant command."""
 
     name, period, needs_state = "constant", 0.1, True
 
@@ -74,7 +74,7 @@ class Constant:
 
 
 def test_a_decision_falls_on_every_multiple_of_the_pilots_period():
-    """At 60 steps a second and 10 decisions: none is missed, and each is within a step of its time."""
+    """At 60 steps and 10 decisions a second no decision is missed, and each is within a step of its time."""
     pilot = Constant()
     runtime = Runtime(VEHICLE, Perception(VEHICLE, POOL), pilot, STATION, arm=True)
     run_lockstep(runtime, Shown(), 3.0)
@@ -84,7 +84,7 @@ def test_a_decision_falls_on_every_multiple_of_the_pilots_period():
 
 
 def test_a_late_loop_misses_decisions_and_counts_them():
-    """After 0.35 s without a step, three of ten a second are gone; the grid stays where it was."""
+    """After 0.35 s without a step, three decisions at 10 Hz are missed; the grid does not shift."""
     pilot = Constant()
     runtime, world = Runtime(VEHICLE, Perception(VEHICLE, POOL), pilot, STATION), Shown()
     for k in range(1, 121):
@@ -96,7 +96,7 @@ def test_a_late_loop_misses_decisions_and_counts_them():
 
 
 def test_ctrl_c_interrupts_a_trial_and_ends_a_gentle_run_in_good_order():
-    """A trial cut short raises; a run of the robot ends with frames that stop its thrusters."""
+    """An interrupted trial raises; an interrupted run of the robot ends with frames that stop its thrusters."""
 
     def press(runtime):
         if runtime.counters.decisions == 5:
@@ -111,7 +111,7 @@ def test_ctrl_c_interrupts_a_trial_and_ends_a_gentle_run_in_good_order():
 
 
 def test_without_arming_no_thruster_is_ever_enabled():
-    """A dry run decides, and sends zeros."""
+    """A dry run makes decisions and sends zeros."""
     runtime, world = Runtime(VEHICLE, Perception(VEHICLE, POOL), Constant(), STATION), Shown()
     run_lockstep(runtime, world, 2.0)
     assert runtime.counters.decisions > 10
@@ -119,7 +119,7 @@ def test_without_arming_no_thruster_is_ever_enabled():
 
 
 def test_an_armed_run_commands_and_ends_with_three_frames_without_thrust():
-    """Armed as soon as the state is ready; disarmed at the end."""
+    """The run arms as soon as the state is ready, and disarms at the end."""
     runtime, world = Runtime(VEHICLE, Perception(VEHICLE, POOL), Constant(), STATION, arm=True), Shown()
     run_lockstep(runtime, world, 2.0)
     enabled = [c.enable for _, c in world.commands()]
@@ -133,7 +133,7 @@ def test_an_armed_run_commands_and_ends_with_three_frames_without_thrust():
     ids=["raises", "nan", "short"],
 )
 def test_a_pilot_that_fails_stops_the_vehicle(wish):
-    """Fault with the reason, and zero frames until somebody acknowledges."""
+    """A fault with the reason follows, and zero frames until it is acknowledged."""
     runtime, world = Runtime(VEHICLE, Perception(VEHICLE, POOL), Constant(wish), STATION, arm=True), Shown()
     run_lockstep(runtime, world, 2.0)
     assert runtime.bridge.state == "fault" and "pilot constant" in runtime.bridge.reason
@@ -141,7 +141,7 @@ def test_a_pilot_that_fails_stops_the_vehicle(wish):
 
 
 def test_it_never_arms_a_second_time():
-    """After a fault the vehicle stays stopped, though everything is well again."""
+    """After a fault the vehicle stays stopped although all conditions are good again."""
     runtime = Runtime(VEHICLE, Perception(VEHICLE, POOL), Constant(), STATION, arm=True)
     world = Shown(telemetry=lambda t: not 1.5 < t < 2.5)
     run_lockstep(runtime, world, 4.0)
@@ -150,7 +150,8 @@ def test_it_never_arms_a_second_time():
 
 
 def test_three_seconds_without_vision_hold_the_vehicle():
-    """No thrust from a second after the pictures ended until they are back; then it goes on by itself."""
+    """There is no thrust from one second after the last picture until pictures return; then thrust resumes by
+    itself."""
     runtime = Runtime(VEHICLE, Perception(VEHICLE, POOL), Constant(), STATION, arm=True)
     world = Shown(pictures=lambda t: not 2.0 < t < 5.0)
     run_lockstep(runtime, world, 7.0)
@@ -160,7 +161,7 @@ def test_three_seconds_without_vision_hold_the_vehicle():
 
 
 def test_the_latency_counts_from_the_newest_picture_in_the_state():
-    """In lock-step a picture waits for the next decision: at most one period of the pilot."""
+    """In lock-step a picture waits for the next decision, at most one period of the pilot."""
     runtime = Runtime(VEHICLE, Perception(VEHICLE, POOL), Constant(), STATION, arm=True)
     run_lockstep(runtime, Shown(), 3.0)
     summary = runtime.counters.summary()
@@ -168,7 +169,7 @@ def test_the_latency_counts_from_the_newest_picture_in_the_state():
 
 
 def test_any_bytes_are_survived():
-    """Garbage, parts of frames and frames of another kind leave the loop running."""
+    """Garbage, partial frames and frames of another kind do not stop the loop."""
     runtime, rng = (
         Runtime(VEHICLE, Perception(VEHICLE, POOL), make_pilot("pid", VEHICLE), STATION, arm=True),
         np.random.default_rng(0),
@@ -187,7 +188,7 @@ def test_any_bytes_are_survived():
 
 
 class Seeing(Constant):
-    """A pilot that sees the picture of a camera of the vehicle, and keeps those that it is shown."""
+    """A pilot that uses the picture of a vehicle camera, and keeps those that it receives."""
 
     def __init__(self):
         super().__init__()
@@ -199,7 +200,7 @@ class Seeing(Constant):
 
 
 class Filmed(Shown):
-    """The same world with readings of the vehicle's own sensors, a tenth of a second late, from 1 s to an end."""
+    """The same world with readings of the vehicle's own sensors, 0.1 s late, from 1 s until a given end."""
 
     def __init__(self, end):
         super().__init__()
@@ -216,7 +217,8 @@ class Filmed(Shown):
 
 
 def test_a_pilot_that_sees_waits_for_pictures_and_stops_when_they_stop():
-    """Not armed before the first; none later than 0.5 s and the camera's 0.1 s after the last, and then no thrust."""
+    """It is not armed before the first picture; thrust ends at most 0.5 s plus the camera's 0.1 s after the
+    last one."""
     pilot, world = Seeing(), Filmed(end=3.0)
     runtime = Runtime(VEHICLE, Perception(VEHICLE, POOL), pilot, STATION, arm=True)
     run_lockstep(runtime, world, 5.0)
@@ -229,7 +231,8 @@ def test_a_pilot_that_sees_waits_for_pictures_and_stops_when_they_stop():
 
 
 def test_the_age_of_pictures_at_the_command_is_measured():
-    """A camera of 10 Hz that is 0.1 s late: exposures are 0.1 to 0.2 s old, as the phase of decisions has it."""
+    """With a 10 Hz camera that is 0.1 s late, exposures are 0.1 to 0.2 s old, depending on the phase of
+    decisions."""
     pilot = Seeing()
     runtime = Runtime(VEHICLE, Perception(VEHICLE, POOL), pilot, STATION, arm=True)
     run_lockstep(runtime, Filmed(end=9.0), 6.0)
@@ -239,6 +242,6 @@ def test_the_age_of_pictures_at_the_command_is_measured():
 
 
 def test_a_vehicle_without_the_camera_is_refused():
-    """Before anything runs, with what there is."""
+    """The refusal comes before anything runs and lists the available sensors."""
     with pytest.raises(ControlError, match="pid sees periscope, which finsrov does not have: .*front_camera"):
         AgentPilot(PidAgent("pid", VEHICLE), VEHICLE, pictures={"periscope": (4, 4, 3)})

@@ -1,4 +1,4 @@
-"""A policy directory that sees, on the robot: the pictures that it names, in its size, through onnxruntime."""
+"""A vision policy on the robot: its named pictures, in its size, through onnxruntime."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def policy(tmp_path_factory):
 
 
 def reading(image):
-    """A vehicle at rest that sees an image."""
+    """Return the reading of a vehicle at rest with an image."""
     pictures = {"front_camera": Picture(1.0, 0, image, source="front_camera")}
     place, level = np.array([0.0, 0.0, -2.0]), np.array([0.0, 0.0, 0.0, 1.0])
     return Reading(1.0, place, level, np.zeros(6), True, pictures=pictures)
@@ -31,7 +31,7 @@ def reading(image):
 
 @pytest.mark.parametrize("finer", [1, 2, 10])
 def test_the_network_gets_the_picture_in_its_own_size(policy, finer):
-    """Whatever the camera's: by area, so that means stay; and what it asks for is thrust along surge and sway."""
+    """Pictures are resized by area, so means are kept; the action is thrust along surge and sway."""
     image = np.zeros((27 * finer, 48 * finer, 3), np.uint8)
     image[:, : 24 * finer, 0], image[..., 2] = 102, 51
     pilot = make_pilot(policy, FINSROV)
@@ -42,7 +42,7 @@ def test_the_network_gets_the_picture_in_its_own_size(policy, finer):
 
 
 def test_what_the_robot_cannot_show_is_refused(policy):
-    """No camera of that name; a gray picture where colours are seen stops the vehicle with a sentence."""
+    """A missing camera is refused; a grey picture in place of a colour one stops the vehicle with a message."""
     blind = FINSROV.model_copy(update={"perception": {"altimeter": FINSROV.perception["altimeter"]}})
     with pytest.raises(
         ControlError, match="policy sees front_camera, which finsrov does not have: .*altimeter"

@@ -1,4 +1,5 @@
-"""What vehicles tell each other: whole or refused, the newest counts, nothing is decided before all have been heard."""
+"""Team messages arrive whole or are refused, the newest counts, and decisions wait until all vehicles have
+been heard."""
 
 import math
 
@@ -20,7 +21,7 @@ def reading(now, ready=True):
 
 
 def test_a_track_comes_back_with_its_age():
-    """Sent 0.3 s after it was measured; the receiver's clock is another."""
+    """The track was sent 0.3 s after its measurement, and the receiver's clock differs."""
     name, track = decode_track(encode_track("left_netter", HERE, 4.3), 100.0)
     assert name == "left_netter" and track.time == pytest.approx(99.7)
     for part in ("position", "quaternion", "nu"):
@@ -84,7 +85,7 @@ def test_nothing_is_decided_before_all_have_been_heard():
 
 
 def test_everybody_has_a_turn_and_tells_nothing_of_an_unknown_place():
-    """Every second, a third of a second after the first; NaN is kept to oneself."""
+    """Each of three sends every second, a third of a second apart; a position of NaN is not sent."""
     team = Team("herder", (), period=1.0, turn=1.0 / 3.0)
     times = [k / 60 for k in range(180) if team.datagrams_to_send(k / 60, reading(k / 60))]
     np.testing.assert_allclose(times, [1 / 3, 4 / 3, 7 / 3], atol=1 / 60)

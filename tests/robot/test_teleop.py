@@ -1,4 +1,5 @@
-"""Hands to a wrench: published gears, dead-man, edges of buttons, lost devices; and an operator with a bridge."""
+"""Hand inputs become a wrench: published gears, dead-man, button edges, lost devices; an operator with a
+bridge."""
 
 import math
 from dataclasses import replace
@@ -18,7 +19,7 @@ FULL = Hands(surge=1.0, sway=-1.0, heave=1.0, yaw=-1.0, dead_man=True)
 
 
 class Shown:
-    """A device that shows what it is told to."""
+    """A device with scripted inputs."""
 
     hands = Hands()
 
@@ -27,7 +28,7 @@ class Shown:
 
 
 def looks(*shown):
-    """The command after each look at (time [s], hands)."""
+    """Return the command after each poll at (time [s], hands)."""
     operator = Operator(Shown())
     commands = []
     for now, operator.device.hands in shown:
@@ -36,7 +37,7 @@ def looks(*shown):
 
 
 def looked(*shown):
-    """The last command after looking at each, 0.1 s apart, beginning with hands that rest."""
+    """Return the last command after polling these 0.1 s apart, beginning with hands at rest."""
     return looks(*((0.1 * i, hands) for i, hands in enumerate((Hands(), *shown))))[-1]
 
 
@@ -88,14 +89,14 @@ def test_a_lost_device_gives_zeros_and_its_return_arms_nothing():
 
 
 def test_silence_counts_as_loss_after_half_a_second():
-    """Until then the last hands hold."""
+    """Until then the last inputs remain in force."""
     *_, silent, lost = looks((0.0, Hands()), (0.1, FULL), (0.5, None), (0.15 + LOST, None))
     assert silent.wrench.any() and lost.lost
 
 
 @given(st.floats(-1.0, 1.0), st.floats(0.0, 0.5), st.floats(0.0, 1.0))
 def test_the_answer_grows_with_the_deflection(deflection, dead_band, expo):
-    """Odd, monotone, nothing within the dead band, full at the end."""
+    """The response is odd, monotone, zero within the dead band and full at the end."""
     (answer, mirrored, more, full) = shaped(
         np.array([deflection, -deflection, min(deflection + 0.01, 1.0), 1.0]), dead_band, expo
     )
@@ -109,7 +110,7 @@ def test_numbers_that_are_none_push_nothing():
 
 
 class Drive:
-    """An operator with a bridge that hears telemetry."""
+    """An operator with a bridge that receives telemetry."""
 
     def __init__(self):
         self.device = Shown()
@@ -118,7 +119,7 @@ class Drive:
         self.i = 0
 
     def turn(self, hands=None, turns=1):
-        """Some turns of 20 ms; returns the last frame."""
+        """Advance some turns of 20 ms and return the last frame."""
         for _ in range(turns):
             self.i += 1
             now = 0.02 * self.i
@@ -146,7 +147,8 @@ class Drive:
 
 
 def test_a_drive_from_arming_to_the_emergency_stop():
-    """Starts disarmed; only the press arms; the stop faults; only after the acknowledgement a press arms again."""
+    """A drive starts disarmed; only a press arms, the stop faults, and only after acknowledgement a press
+    arms again."""
     drive = Drive()
     assert not drive.turn(FULL, 10).enable and drive.bridge.state == "disarmed"
     drive.turn(replace(FULL, arm=True))
@@ -193,7 +195,7 @@ def test_an_unplugged_pad_disarms():
 
 
 class SlowAutopilot:
-    """Arms when it is asked often enough, and never gives way."""
+    """An autopilot that arms after several requests and never refuses."""
 
     peer, watched = "autopilot", (("gyro",),)
 
@@ -224,7 +226,7 @@ class SlowAutopilot:
     ids=["one press", "too slow", "sticks moved", "emergency stop", "device lost", "second press"],
 )
 def test_one_press_waits_for_an_autopilot_to_arm(asks, meanwhile, state):
-    """It is asked again until it is ready or time is up; whatever else the hands do ends the wait for good."""
+    """The request is repeated until the autopilot is ready or time is up; any other input cancels the wait."""
     drive = Drive()
     drive.bridge.autopilot = SlowAutopilot(asks)
     drive.turn(Hands(), 2)

@@ -1,4 +1,5 @@
-"""A whole drive by hand over a wire: starts disarmed, drives while held, ends without thrust, and is on record."""
+"""A whole teleoperated drive over a wire: it starts disarmed, thrusts while held, ends without thrust and is
+recorded."""
 
 import json
 import os
@@ -24,7 +25,7 @@ VEHICLE = load_vehicle("finsrov")
 
 
 class Script:
-    """Hands by the time since the start: arm at 0.5 s, drive from 1 s to 2 s."""
+    """Scripted hands: arm at 0.5 s, drive from 1 s to 2 s."""
 
     def __init__(self, drives=True):
         self.drives = drives
@@ -36,7 +37,7 @@ class Script:
 
 
 class World:
-    """A clock that a wait moves on, and a motor controller that answers at every turn."""
+    """A clock that `wait` advances, and a motor controller that answers at every turn."""
 
     def __init__(self):
         self.now, self.sent = 0.0, 0
@@ -45,7 +46,7 @@ class World:
         self.frames = []
 
     def drive(self, runtime, **how):
-        """As `wiring.connected` gives it."""
+        """Drive as with `wiring.connected`."""
         return run_realtime(runtime, Wires(self.ours), clock=self.clock, wait=self.wait, **how)
 
     def clock(self):
@@ -78,7 +79,7 @@ def world():
 
 @pytest.mark.slow
 def test_a_drive_by_hand(world):
-    """Thrust only while the hand is on; the last three frames are off."""
+    """Thrust occurs only during hand input; the last three frames are disabled."""
     runtime = drive(VEHICLE, Script(), world.drive, settings=DriveSettings(duration=3.0))
     moving = [t for t, frame in world.frames if frame.enable and any(frame.normalised)]
     assert 1.0 <= moving[0] < 1.2 and 2.0 <= moving[-1] < 2.3
@@ -109,7 +110,7 @@ def test_a_device_that_vanishes_disarms(world):
 
 @pytest.mark.slow
 def test_a_drive_is_recorded(world, tmp_path):
-    """Telemetry, commands and events; it becomes a trial that its shaft speeds drive."""
+    """Telemetry, commands and events are recorded, and convert to a trial driven by its shaft speeds."""
     pytest.importorskip("mcap")
     pytest.importorskip("rosbags")
     from finssim.robot.record_reader import describe_record, open_record
@@ -125,7 +126,7 @@ def test_a_drive_is_recorded(world, tmp_path):
 
 
 class Hold:
-    """Asks for the same everywhere."""
+    """A controller with a constant command."""
 
     name, period, needs_state = "hold", 0.05, False
 
@@ -154,7 +155,7 @@ class Modes(Script):
 
 @pytest.mark.slow
 def test_the_mode_button_hands_over_to_a_controller_and_back(world):
-    """The controller's thrust comes from 1 s on, the person's zeros again from 2 s on."""
+    """Thrust is the controller's from 1 s, and the operator's zeros from 2 s."""
     drive(VEHICLE, Modes(), world.drive, settings=DriveSettings(duration=3.0), handover=HELD)
     moving = [t for t, frame in world.frames if frame.enable and any(frame.normalised)]
     assert 1.0 <= moving[0] < 1.2 and 2.0 <= moving[-1] < 2.3
@@ -162,7 +163,7 @@ def test_the_mode_button_hands_over_to_a_controller_and_back(world):
 
 @pytest.mark.slow
 def test_who_steers_is_on_record(world, tmp_path):
-    """An event at every press of the mode button."""
+    """Every press of the mode button is recorded as an event."""
     pytest.importorskip("mcap")
     pytest.importorskip("rosbags")
     from finssim.robot.record_reader import open_record
@@ -205,7 +206,7 @@ def test_what_would_do_nothing_or_lead_out_of_the_pool_is_refused(capsys, tmp_pa
 
 
 def test_pictures_come_to_the_port_after_the_robots_own():
-    """Of the end that was asked for, in `run` and in `teleop`."""
+    """The addresses are those of the requested end, in `run` and in `teleop`."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -217,8 +218,8 @@ def test_pictures_come_to_the_port_after_the_robots_own():
 
 
 def test_a_terminal_that_closes_ends_a_loop_in_good_order():
-    """As Ctrl-C does; where hanging up is ignored, it stays so."""
-    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)  # nohup has it ignored from the start
+    """A hang-up ends the loop as Ctrl-C does; if it is ignored beforehand, it stays ignored."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)  # nohup ignores it from the start
     try:
         with interruptible() as interrupted:
             os.kill(os.getpid(), signal.SIGHUP)

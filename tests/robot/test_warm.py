@@ -1,4 +1,4 @@
-"""A robot has everything in memory before it moves: a process that first imports or compiles misses its deadlines."""
+"""Everything is loaded before a robot moves: a process that first imports or compiles misses its deadlines."""
 
 import json
 import subprocess
@@ -43,7 +43,7 @@ print(json.dumps(["armed" in states, runtime.counters.decisions, sorted(in_memor
 @pytest.mark.slow
 @pytest.mark.parametrize("controller", ["pid", "lqr"])
 def test_nothing_is_imported_or_compiled_once_the_loop_has_begun(controller, tmp_path):
-    """Neither by the filter, nor by the controller, nor by the record, up to and after the first armed decision."""
+    """This holds for filter, controller and record, up to and after the first armed decision."""
     words = [sys.executable, "-c", LOOP, controller, str(tmp_path / "run.mcap")]
     answer = subprocess.run(words, stdout=subprocess.PIPE, text=True, check=True, timeout=300).stdout
     armed, decisions, added = json.loads(answer.splitlines()[-1])

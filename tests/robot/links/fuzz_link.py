@@ -1,8 +1,8 @@
 """Fuzz the decoders of both ends: `PYTHONPATH=tests python -m robot.links.fuzz_link [--frames 1000000] [--seed 0]`.
 
-A stream of mutated frames, cut in pieces, goes through a decoder; what comes out must be what trying every byte as a
-beginning finds, with a CRC of its own (`wire.frames_in`). So nothing with a wrong CRC gets out, and nothing true is
-lost. `fuzz_link_guided.py` lets coverage choose the mutations.
+A stream of mutated frames, cut in pieces, passes through a decoder. The result must equal an independent search that
+tries every byte as the beginning of a frame with its own CRC (`wire.frames_in`), so no frame with a wrong CRC is
+accepted and no valid one is lost. `fuzz_link_guided.py` chooses mutations by coverage.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from robot.links.test_frames import COMMAND, ECHO, TELEMETRY
 
 SIDES = ("host", "mcu")
 ZEROS = bytes(128)
-"""Longer than a frame, and the beginning of none: what a decoder keeps back comes out before its end."""
+"""Zeros longer than a frame, and not the beginning of one: they flush what a decoder keeps back."""
 
 
 class Fuzzer:
-    """Mutates frames, and judges decoders."""
+    """Mutator of frames and judge of decoders."""
 
     def __init__(self, seed: int = 0) -> None:
         self.random = random.Random(seed)
@@ -40,7 +40,8 @@ class Fuzzer:
         )
 
     def stream(self, side: str) -> bytes:
-        """One to four frames, each as it is or mutated one to three times, half of those with a CRC made right."""
+        """Return one to four frames, each unchanged or mutated one to three times, half of the mutated ones
+        with a valid CRC."""
         found = b""
         for _ in range(self.random.randint(1, 4)):
             frame = self.random.choice(self.seeds[side])
@@ -58,39 +59,39 @@ class Fuzzer:
         return self._changed(data, lambda byte: byte ^ 1 << self.random.randrange(8))
 
     def put(self, data: bytes, side: str) -> bytes:
-        """Give one byte a value that means something."""
+        """Set one byte to a meaningful value."""
         return self._changed(data, lambda _: self.random.choice(b"\xa5\x5a\xaa\xbb\xac\xca\x00\x01\x02\xff"))
 
     def remove(self, data: bytes, side: str) -> bytes:
-        """Lose some bytes."""
+        """Remove some bytes."""
         at = self.random.randrange(len(data) + 1)
         return data[:at] + data[at + self.random.randint(1, 6) :]
 
     def insert(self, data: bytes, side: str) -> bytes:
-        """Get some bytes, or the beginning of another frame."""
+        """Insert some bytes or the beginning of another frame."""
         at = self.random.randrange(len(data) + 1)
         other = self.random.choice(self.seeds[side])[: self.random.randint(1, 20)]
         more = self.random.choice((other, self.random.randbytes(self.random.randint(1, 6))))
         return data[:at] + more + data[at:]
 
     def cut(self, data: bytes, side: str) -> bytes:
-        """Lose the end, or the beginning."""
+        """Cut off the end or the beginning."""
         at = self.random.randrange(len(data) + 1)
         return self.random.choice((data[:at], data[at:]))
 
     def swap(self, data: bytes, side: str) -> bytes:
-        """Go on with the rest of another frame."""
+        """Continue with the rest of another frame."""
         at = self.random.randrange(len(data) + 1)
         return data[:at] + self.random.choice(self.seeds[side])[at:]
 
     def number(self, data: bytes, side: str) -> bytes:
-        """Write a number that is not finite, or at the end of what is."""
+        """Write a number that is not finite or at an extreme of the range."""
         value = self.random.choice((float("nan"), float("inf"), -float("inf"), 3.4e38, -0.0, 1e-45))
         at = self.random.randrange(0, max(len(data) - 4, 1), 2) + self.random.randrange(2)
         return data[:at] + struct.pack("<f", value) + data[at + 4 :]
 
     def length(self, data: bytes, side: str) -> bytes:
-        """Announce another length."""
+        """Announce a different length."""
         value = self.random.choice((0, 8, 52, 84, 86, 256, 65535, self.random.randrange(120)))
         return data[:4] + struct.pack("<H", value) + data[6:]
 
@@ -101,14 +102,15 @@ class Fuzzer:
         return data[:at] + bytes([change(data[at])]) + data[at + 1 :]
 
     def step(self) -> None:
-        """One stream for one side, in up to four pieces."""
+        """Judge one stream for one side, in up to four pieces."""
         side = self.random.choice(SIDES)
         stream = self.stream(side)
         self.accepted += judge(stream, side, [self.random.randrange(len(stream) + 1) for _ in range(3)])
 
 
 def judge(stream: bytes, side: str, cuts=()) -> int:
-    """How many messages a decoder finds in a stream that comes in pieces; raises where they are not the true ones."""
+    """Return the number of messages that a decoder finds in a stream cut in pieces; raise if they are not the
+    true ones."""
     decoder = Decoder({"host": HOST, "mcu": MCU}[side])
     found, begin = [], 0
     for end in (*sorted(cuts), len(stream)):

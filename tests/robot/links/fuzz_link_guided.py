@@ -1,7 +1,7 @@
 """Fuzz the decoders guided by coverage: `PYTHONPATH=tests python -m robot.links.fuzz_link_guided FOLDER -runs=1000000`.
 
-Needs atheris (`pip install atheris`), which keeps streams that reach new lines in FOLDER and mutates those further; the
-words after the name are libFuzzer's. Each stream is judged as in `fuzz_link.py`.
+Needs atheris (`pip install atheris`), which keeps streams that reach new lines in FOLDER and mutates them further; the
+remaining arguments are libFuzzer's. Each stream is judged as in `fuzz_link.py`.
 """
 
 import sys
@@ -16,7 +16,7 @@ FUZZER = Fuzzer()
 
 
 def mutate(data: bytes, size: int, seed: int) -> bytes:
-    """A mutation of libFuzzer's, or one of frames: no chance bytes would have a right CRC again."""
+    """Return a mutation by libFuzzer or one of frames, because random bytes hardly ever have a valid CRC."""
     FUZZER.random.seed(seed)
     if not data or FUZZER.random.random() < 0.3:
         return atheris.Mutate(data, size)
@@ -27,7 +27,7 @@ def mutate(data: bytes, size: int, seed: int) -> bytes:
 
 
 def judge_one(data: bytes) -> None:
-    """The first byte says whose decoder it is and where the stream is cut."""
+    """Judge one stream; the first byte selects the decoder and the cut."""
     if data:
         judge(data[1:], SIDES[data[0] & 1], [data[0] % len(data)])
 

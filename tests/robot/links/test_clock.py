@@ -1,4 +1,4 @@
-"""The controller's clock against the robot's: late by jitter, gaining or losing, wrapping, set back and moved."""
+"""The controller's clock mapped to the robot's under jitter, drift, wrap-around, resets and steps."""
 
 import numpy as np
 import pytest
@@ -8,11 +8,11 @@ from hypothesis import strategies as st
 from finssim.robot.links.clock import ClockMap
 
 LEAST = 0.002
-"""Delay that no frame is spared [s]."""
+"""Minimum delay of every frame [s]."""
 
 
 def frames(duration, *, rate=100.0, drift=0.0, start_ms=0, jitter=0.004, seed=0):
-    """Times at which frames are made, robot's clock [s], their stamps modulo 2³² [ms], and their arrivals [s]."""
+    """Return creation times on the robot's clock [s], stamps modulo 2³² [ms] and arrival times [s] of frames."""
     rng = np.random.default_rng(seed)
     made = 1000.0 + np.arange(0.0, duration, 1.0 / rate)
     ms = (start_ms + np.floor(1e3 * (made - made[0]) / (1.0 + drift))).astype(np.int64) % (1 << 32)
@@ -25,7 +25,8 @@ def stamps(clock, ms, arrival):
 
 
 def test_jitter_of_arrival_is_removed():
-    """After ten seconds stamps are the true times plus the least delay, within the clock's millisecond and one more."""
+    """After ten seconds stamps are the true times plus the least delay, to within the clock's millisecond
+    plus one more."""
     made, ms, arrival = frames(60.0)
     error = (stamps(ClockMap(), ms, arrival) - made - LEAST)[1000:]
     assert np.abs(error).max() < 0.002
@@ -34,7 +35,7 @@ def test_jitter_of_arrival_is_removed():
 
 @pytest.mark.parametrize("drift", [-0.01, -2e-4, 5e-5, 0.003])
 def test_drift_is_found_and_followed(drift):
-    """A crystal that loses or gains, up to that of an RC oscillator, is told to 20 ppm and does not show in stamps."""
+    """A drift of up to that of an RC oscillator is estimated to 20 ppm and does not show in the stamps."""
     clock = ClockMap()
     made, ms, arrival = frames(120.0, drift=drift)
     error = (stamps(clock, ms, arrival) - made - LEAST)[1000:]
@@ -49,7 +50,7 @@ def test_drift_is_found_and_followed(drift):
 )
 @settings(max_examples=300, deadline=None)
 def test_no_stamp_is_later_than_its_arrival(steps, start):
-    """Whatever the controller's clock says and however the robot's own moves."""
+    """This holds for any controller clock and any motion of the robot's own clock."""
     clock, arrival = ClockMap(), 5.0
     for i, (ms, gap) in enumerate(steps):
         arrival += gap
@@ -57,7 +58,7 @@ def test_no_stamp_is_later_than_its_arrival(steps, start):
 
 
 def test_the_clock_goes_through_its_wrap():
-    """Forty-nine days after its start the counter begins at 0 again, and the stamps go on."""
+    """After forty-nine days the counter restarts at 0 and the stamps continue."""
     clock = ClockMap()
     made, ms, arrival = frames(40.0, start_ms=(1 << 32) - 20_000)
     assert ms[-1] < ms[0]
@@ -68,7 +69,7 @@ def test_the_clock_goes_through_its_wrap():
 
 @pytest.mark.parametrize("uptime", [2_000, 3_000_000_000])
 def test_a_reboot_is_noticed_with_its_first_frame(uptime):
-    """The counter small again after seconds or weeks: counted at once, and stamps are right from then on."""
+    """A small counter after seconds or weeks is counted at once, and stamps are right from then on."""
     clock = ClockMap()
     made, ms, arrival = frames(20.0, start_ms=uptime)
     stamps(clock, ms, arrival)
@@ -82,7 +83,8 @@ def test_a_reboot_is_noticed_with_its_first_frame(uptime):
 
 @pytest.mark.parametrize("old", [20, 200, 450])
 def test_a_frame_overtaken_by_others_gets_its_own_time(old):
-    """Late by up to seconds, it is stamped between its neighbours; no reboot would have counted so far so soon."""
+    """A frame up to seconds late is stamped between its neighbours; no rebooted counter could be so high so
+    soon."""
     clock = ClockMap()
     made, ms, arrival = frames(20.0)
     stamps(clock, ms, arrival)
@@ -93,7 +95,7 @@ def test_a_frame_overtaken_by_others_gets_its_own_time(old):
 
 
 def test_a_reboot_soon_after_the_start_is_no_overtaken_frame():
-    """Up for 3 s, then up for 0.1 s: only three seconds back, and still a reboot."""
+    """A counter of 0.1 s after 3 s is only three seconds back, and still a reboot."""
     clock = ClockMap()
     made, ms, arrival = frames(3.0)
     stamps(clock, ms, arrival)
@@ -103,7 +105,8 @@ def test_a_reboot_soon_after_the_start_is_no_overtaken_frame():
 
 @pytest.mark.parametrize("back", [2_000, 8_000])
 def test_a_step_back_of_the_controllers_clock_is_a_jump(back):
-    """Set back while it runs, as no reboot does: counted once, and in time stamps are right again."""
+    """A clock set back while running, unlike a reboot, is counted once, and stamps are eventually right
+    again."""
     clock = ClockMap()
     made, ms, arrival = frames(60.0, start_ms=50_000)
     half = ms.size // 2
@@ -115,7 +118,7 @@ def test_a_step_back_of_the_controllers_clock_is_a_jump(back):
 
 @pytest.mark.parametrize("step", [40.0, -40.0, 0.6, -0.6])
 def test_a_step_of_the_robots_clock_is_a_jump(step):
-    """Forward or back, it is counted once, and two seconds later stamps are right again."""
+    """A forward or backward step is counted once; two seconds later stamps are right again."""
     clock = ClockMap()
     made, ms, arrival = frames(30.0)
     half = ms.size // 2
@@ -126,7 +129,7 @@ def test_a_step_of_the_robots_clock_is_a_jump(step):
 
 
 def test_frames_that_waited_together_keep_their_own_times():
-    """A stall of two seconds, then everything at once: stamps are those of a wire without a stall."""
+    """After a stall of two seconds and a burst, stamps are the same as without the stall."""
     clock = ClockMap()
     made, ms, arrival = frames(30.0)
     stalled = (arrival > 1020.0) & (arrival < 1022.0)
@@ -137,7 +140,7 @@ def test_frames_that_waited_together_keep_their_own_times():
 
 
 def test_what_waited_before_the_start_does_not_stay_in_the_stamps():
-    """Three seconds of frames read at once: from the last of them on, stamps are right."""
+    """After three seconds of frames read at once, stamps are right from the last of them on."""
     clock = ClockMap()
     made, ms, arrival = frames(30.0)
     arrival[:300] = arrival[299]
@@ -147,7 +150,7 @@ def test_what_waited_before_the_start_does_not_stay_in_the_stamps():
 
 
 def test_memory_stays_small():
-    """An hour keeps no more frames than seconds in the window."""
+    """After an hour no more frames are kept than the window has seconds."""
     clock = ClockMap(window=10.0)
     _, ms, arrival = frames(3600.0, rate=10.0)
     stamps(clock, ms, arrival)
@@ -155,7 +158,7 @@ def test_memory_stays_small():
 
 
 def test_a_short_window_forgets_a_wire_that_was_faster():
-    """Delay grows by 50 ms for good: stamps follow when the window has passed."""
+    """After a lasting increase of the delay by 50 ms, stamps follow once the window has passed."""
     made, ms, arrival = frames(60.0)
     arrival[3000:] += 0.05
     late = {}

@@ -1,4 +1,4 @@
-"""Frames out of streams: in pieces, after garbage, cut, damaged; what is found is what was sent, and no more."""
+"""Frames are found exactly as sent in streams that are split, preceded by garbage, cut or damaged."""
 
 import dataclasses
 import math
@@ -13,7 +13,7 @@ from robot.links import wire
 from robot.links.test_frames import COMMAND, ECHO, TELEMETRY
 
 TELEMETRY32 = wire.frame_at(wire.telemetry_bytes(TELEMETRY), 0, "host")[1]
-"""As its numbers are in single precision."""
+"""Telemetry with its numbers in single precision."""
 CONFIG = DebugConfig(3, 1, 10)
 FRAMES = {
     "telemetry": (HOST, wire.telemetry_bytes(TELEMETRY), TELEMETRY32),
@@ -36,7 +36,7 @@ GARBAGE = st.lists(BEGINNINGS, max_size=8).map(b"".join)
 
 @given(st.lists(wire.telemetries() | wire.echoes(), max_size=5), st.lists(st.integers(1, 120), max_size=20))
 def test_a_host_hears_what_was_sent_in_any_pieces(messages, cuts):
-    """Bytes come as the line delivers them; messages come out whole, in order, once."""
+    """For any splitting of the bytes, messages come out whole, in order and once."""
     pack = {True: wire.echo_bytes, False: wire.telemetry_bytes}
     stream = b"".join(pack[hasattr(m, "applied")](m) for m in messages)
     decoder, found = Decoder(HOST), []
@@ -51,7 +51,7 @@ def test_a_host_hears_what_was_sent_in_any_pieces(messages, cuts):
     st.lists(wire.commands(6) | wire.debug_configs(), max_size=5), st.lists(st.integers(1, 40), max_size=20)
 )
 def test_a_motor_controller_hears_what_was_sent_in_any_pieces(messages, cuts):
-    """The same at the other end, for six outputs."""
+    """The same holds at the other end, for six outputs."""
     stream = b"".join(
         wire.command_bytes(m) if hasattr(m, "enable") else wire.debug_config_bytes(m) for m in messages
     )
@@ -65,7 +65,7 @@ def test_a_motor_controller_hears_what_was_sent_in_any_pieces(messages, cuts):
 @EACH
 @given(garbage=GARBAGE)
 def test_a_true_frame_behind_any_garbage_is_found(kinds, frame, message, garbage):
-    """False beginnings in it announce at most `longest` bytes, and hide nothing of what follows them."""
+    """False beginnings in garbage announce at most `longest` bytes, and hide nothing that follows them."""
     decoder = Decoder(kinds)
     assert decoder.feed(garbage + frame + bytes(decoder.longest)) == [message]
     assert decoder.skipped_bytes == len(garbage) + decoder.longest
@@ -73,7 +73,7 @@ def test_a_true_frame_behind_any_garbage_is_found(kinds, frame, message, garbage
 
 @EACH
 def test_a_frame_cut_anywhere_costs_only_itself(kinds, frame, message):
-    """Its end lost in transit: the next one is found, whichever byte was the last."""
+    """If the end of a frame is lost, the next one is found, wherever the cut was."""
     for cut in range(len(frame)):
         decoder = Decoder(kinds)
         assert decoder.feed(frame[:cut]) == []
@@ -83,7 +83,7 @@ def test_a_frame_cut_anywhere_costs_only_itself(kinds, frame, message):
 
 @EACH
 def test_no_frame_with_a_wrong_bit_is_accepted(kinds, frame, message):
-    """Each bit in turn: nothing comes out, and the frame after it does."""
+    """With each bit flipped in turn, the frame is dropped and the next one is found."""
     for bit in range(8 * len(frame)):
         damaged = bytearray(frame)
         damaged[bit // 8] ^= 1 << bit % 8
@@ -95,7 +95,7 @@ def test_no_frame_with_a_wrong_bit_is_accepted(kinds, frame, message):
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize(("side", "name"), [("host", "telemetry"), ("host", "echo"), ("mcu", "command")])
 def test_a_number_that_is_not_finite_is_refused_wherever_it_stands(side, name, bad):
-    """In any field with a right CRC: counted as such, and the frame after it is found."""
+    """A non-finite number in any field with a valid CRC is counted as such, and the next frame is found."""
     kinds, frame, message = FRAMES[name]
     first, last = {"telemetry": (12, 60), "echo": (28, 92), "command": (2, 34)}[name]
     places = [*range(first, last, 4), *(range(64, 96, 4) if name == "telemetry" else ())]
@@ -117,7 +117,7 @@ def test_a_number_that_is_not_finite_is_refused_wherever_it_stands(side, name, b
     ],
 )
 def test_what_was_wrong_is_counted(change, count):
-    """A type or a version of the future, another length, a CRC that does not fit."""
+    """An unknown type or version, a wrong length and a wrong CRC each have their counter."""
     decoder = Decoder(HOST)
     good = wire.telemetry_bytes(TELEMETRY)
     assert decoder.feed(change(good) + good) == [TELEMETRY32]
@@ -126,7 +126,7 @@ def test_what_was_wrong_is_counted(change, count):
 
 
 def test_frames_for_another_number_of_outputs_are_refused():
-    """A vehicle with six motors is not heard as one with eight, nor told what eight should do."""
+    """Frames of a vehicle with six motors are not accepted as those of one with eight, in either direction."""
     for kinds, name in ((HOST, "telemetry"), (HOST, "echo"), (MCU, "command")):
         decoder = Decoder(kinds, outputs=6)
         assert decoder.feed(FRAMES[name][1] + bytes(200)) == []
@@ -134,7 +134,7 @@ def test_frames_for_another_number_of_outputs_are_refused():
 
 
 def test_each_side_hears_only_what_is_meant_for_it():
-    """Commands are nothing to a host, telemetry nothing to a motor controller."""
+    """A host ignores commands, a motor controller ignores telemetry."""
     commands = FRAMES["command"][1] + FRAMES["debug configuration"][1]
     telemetry = FRAMES["telemetry"][1] + FRAMES["echo"][1]
     assert Decoder(HOST).feed(commands + bytes(100)) == []
@@ -142,13 +142,13 @@ def test_each_side_hears_only_what_is_meant_for_it():
 
 
 def test_telemetry_without_speeds_says_so():
-    """None, not zeros: the motors of an older firmware are not known to stand still."""
+    """Missing speeds are None, not zeros: the motors of an older firmware may be turning."""
     older = dataclasses.replace(TELEMETRY32, motor_rpm=None)
     assert Decoder().feed(wire.telemetry_bytes(older)) == [older]
 
 
 def test_any_byte_but_zero_enables():
-    """As C has it: a firmware may send 255 for true."""
+    """As in C, any non-zero byte is true: a firmware may send 255."""
     frame = FRAMES["command"][1]
     assert Decoder(MCU).feed(wire.sealed(frame[:1] + b"\xff" + frame[2:])) == [COMMAND]
 
@@ -156,7 +156,7 @@ def test_any_byte_but_zero_enables():
 @given(st.lists(GARBAGE, max_size=30))
 @settings(max_examples=50)
 def test_what_is_kept_is_less_than_a_frame(pieces):
-    """However much garbage comes: what is neither skipped nor a frame is at most one beginning."""
+    """For any amount of garbage the buffer contains at most one beginning of a frame."""
     decoder, fed = Decoder(HOST), 0
     for piece in pieces:
         decoder.feed(piece)

@@ -1,4 +1,4 @@
-"""Bytes on the wire: every kind of frame against one packed by hand, and what has no place in a frame."""
+"""Every kind of frame equals one packed by hand, and values that do not fit a frame are refused."""
 
 import dataclasses
 import math
@@ -42,13 +42,13 @@ COMMAND = ThrusterCommand(True, (0.0, 0.125, -0.25, 0.5, -0.5, 0.75, -1.0, 1.0))
 
 
 def test_the_crc_is_modbus():
-    """The check value of the catalogues of CRCs: 0x4B37 for the digits 1 to 9."""
+    """The check value of the CRC catalogues is 0x4B37 for the digits 1 to 9."""
     assert crc16_modbus(b"123456789") == wire.crc_bitwise(b"123456789") == 0x4B37
 
 
 @given(st.binary(max_size=300))
 def test_the_crc_is_that_of_single_bits(data):
-    """Pairs of bytes through a table give what bits one after another give, for odd lengths too."""
+    """The table for pairs of bytes gives the bitwise result, also for odd lengths."""
     assert crc16_modbus(data) == wire.crc_bitwise(data) == wire.crc_bytewise(data)
 
 
@@ -89,7 +89,7 @@ def test_an_echo_is_these_bytes():
 
 
 def test_a_debug_configuration_is_these_bytes():
-    """AC CA, type 1, version 1, 8 bytes of payload, two of them reserved: 16 bytes and the CRC."""
+    """AC CA, type 1, version 1, 8 bytes of payload, two of them reserved: 16 bytes including the CRC."""
     frame = encode_debug_config(sequence=3, mask=DEBUG_ECHO, decimation=10)
     assert frame[:-2] == bytes.fromhex("acca 01 01 0800 0300 01000000 0a00 0000")
     assert frame[-2:] == struct.pack("<H", wire.crc_bitwise(frame[2:-2]))
@@ -97,7 +97,7 @@ def test_a_debug_configuration_is_these_bytes():
 
 @given(st.integers(1, 12).flatmap(lambda n: st.tuples(wire.commands(n), wire.telemetries(n), wire.echoes(n))))
 def test_any_number_of_outputs_is_packed_as_by_hand(messages):
-    """Vehicles with other motors: the arrays grow, nothing else moves."""
+    """For vehicles with other motors the arrays grow and nothing else moves."""
     command, telemetry, echo = messages
     assert encode_command(command) == wire.command_bytes(command)
     assert encode_telemetry(telemetry) == wire.telemetry_bytes(telemetry)
@@ -106,7 +106,7 @@ def test_any_number_of_outputs_is_packed_as_by_hand(messages):
 
 @pytest.mark.parametrize("wrong", [math.nan, math.inf, -math.inf, 1.0001, -3.0])
 def test_a_command_that_is_no_share_of_full_speed_is_not_sent(wrong):
-    """Beyond ±1, not a number, infinite: refused before it becomes bytes."""
+    """Values beyond ±1, not a number or infinite are refused before encoding."""
     with pytest.raises(LinkError, match="normalised"):
         encode_command(ThrusterCommand(True, (0.0, wrong)))
 
@@ -122,13 +122,14 @@ def test_a_command_that_is_no_share_of_full_speed_is_not_sent(wrong):
     ],
 )
 def test_a_number_without_room_on_the_wire_is_refused(field, value):
-    """Counters beyond their bits, depths beyond single precision, what is not finite."""
+    """Counters beyond their bits, depths beyond single precision and non-finite numbers are refused."""
     with pytest.raises(LinkError, match=r"telemetry: .*"):
         encode_telemetry(dataclasses.replace(TELEMETRY, **{field: value}))
 
 
 def test_arrays_of_other_lengths_are_refused():
-    """A quaternion of three numbers, an echo of eight outputs that applied seven, a command for none."""
+    """Refused are a quaternion of three numbers, an echo of eight outputs with seven applied, and an empty
+    command."""
     with pytest.raises(LinkError, match="quaternion has 3 values, expected 4"):
         encode_telemetry(dataclasses.replace(TELEMETRY, quaternion=(0.0, 0.0, 1.0)))
     with pytest.raises(LinkError, match="applied has 7 values, expected 8"):
@@ -138,7 +139,7 @@ def test_arrays_of_other_lengths_are_refused():
 
 
 def test_status_bits_are_where_the_firmware_has_them():
-    """Bits 24 to 31 by name, the low byte of the count of commands in bits 16 to 23; reject flags 2, 4 and 8."""
+    """Bits 24 to 31 by name, the low byte of the command count in bits 16 to 23; reject flags 2, 4 and 8."""
     assert [flag.value.bit_length() - 1 for flag in StatusFlag] == list(range(24, 32))
     assert StatusFlag.COMMAND_RECEIVED == 1 << 24
     assert StatusFlag.DIAGNOSTICS & TELEMETRY.flags
@@ -150,7 +151,7 @@ EXACT = dataclasses.replace(TELEMETRY, quaternion=(0.0, 0.0, 0.0, 1.0))
 
 
 def test_with_other_actuators_frames_are_of_version_2():
-    """Setpoints follow the thrusters of a command, values those of telemetry; all else is as in version 1."""
+    """Setpoints follow the thrusters of a command, values those of telemetry; the rest is as in version 1."""
     command = dataclasses.replace(COMMAND, setpoints=(0.25, -0.5, 2.0**-12))
     telemetry = dataclasses.replace(EXACT, actuators=(0.25, -0.5, 2.0**-12))
     assert encode_command(command) == wire.command_bytes(command) and len(wire.command_bytes(command)) == 53
@@ -164,7 +165,7 @@ def test_with_other_actuators_frames_are_of_version_2():
 
 
 def test_a_peer_of_version_1_finds_no_frame_in_version_2():
-    """It counts them as another type, and hears what it knows behind them."""
+    """A peer of version 1 counts such frames as an unknown type, and reads known frames that follow."""
     for kinds, one, two in (
         (MCU, COMMAND, dataclasses.replace(COMMAND, setpoints=(0.1,))),
         (HOST, EXACT, dataclasses.replace(EXACT, actuators=(0.1,))),
@@ -176,6 +177,6 @@ def test_a_peer_of_version_1_finds_no_frame_in_version_2():
 
 
 def test_a_setpoint_that_is_no_number_is_not_sent():
-    """As for thrusts: the sender is refused."""
+    """As for thrusts, encoding is refused."""
     with pytest.raises(LinkError, match="setpoints is .*, expected finite numbers"):
         encode_command(dataclasses.replace(COMMAND, setpoints=(math.nan,)))

@@ -1,4 +1,4 @@
-"""Fuzzing, a little of it at every run: see `fuzz_link.py` for more of the same."""
+"""A short fuzzing run; `fuzz_link.py` does longer ones."""
 
 import pytest
 
@@ -8,7 +8,7 @@ from robot.links.fuzz_link import Fuzzer
 
 
 def test_no_mutated_frame_upsets_a_decoder():
-    """Ten thousand of them: exactly the true ones come out, and nothing is raised."""
+    """Of ten thousand mutated frames exactly the valid ones come out, and nothing is raised."""
     fuzzer = Fuzzer(seed=1)
     while fuzzer.frames < 10_000:
         fuzzer.step()
@@ -16,7 +16,7 @@ def test_no_mutated_frame_upsets_a_decoder():
 
 
 def test_the_fuzzer_would_notice_an_accepted_wrong_crc(monkeypatch):
-    """A decoder that takes every CRC is caught within a few frames."""
+    """A decoder that accepts every CRC is caught within a few frames."""
     monkeypatch.setattr(frames, "crc16_modbus", AlwaysRight)
     fuzzer = Fuzzer(seed=1)
     with pytest.raises(AssertionError, match="found"):
@@ -25,7 +25,7 @@ def test_the_fuzzer_would_notice_an_accepted_wrong_crc(monkeypatch):
 
 
 class AlwaysRight(int):
-    """The right CRC, and equal to any other."""
+    """A CRC that equals any other."""
 
     def __new__(cls, data):
         return super().__new__(cls, crc16_modbus(data))

@@ -1,4 +1,4 @@
-"""The link to an autopilot, against the emulated ArduSub in lock-step; `studies.faults` tests how it ends."""
+"""The link to an autopilot, against the emulated ArduSub in lock-step; `studies.faults` tests how runs end."""
 
 import math
 from dataclasses import replace
@@ -40,9 +40,9 @@ def drive(
     calibrate=False,
     yaw=0.0,
 ):
-    """A PID in lock-step with the pool; the runtime, what truly happened, the link and what it sent.
+    """Run a PID in lock-step with the pool; return the runtime, the true motion, the link and the frames that it sent.
 
-    Without `log` the Doppler log reaches the autopilot alone, which has a position after 2 s. `meanwhile` is called
+    Without `log` only the autopilot receives the Doppler log and has a position after 2 s. `meanwhile` is called
     with the pool and may return frames of another ground station; `firmware` changes the spec.
     """
     spec = SPEC.firmware.model_copy(update={"aiding_delay": 2.0, **(firmware or {})})
@@ -67,7 +67,8 @@ def drive(
 
 @pytest.mark.slow
 def test_a_pid_swims_to_its_goal_by_axes_and_doppler_log():
-    """Armed by MAVLink, steered by axes, located by Doppler log, depth and compass; disarmed at the end."""
+    """The PID arms by MAVLink, steers by axes, locates itself by Doppler log, depth and compass, and disarms
+    at the end."""
     runtime, pool, link, _, _ = drive(16.0)
     assert runtime.bridge.state == "disarmed" and not pool.firmware.armed
     assert [event.kind for event in runtime.counters.events].count("armed") == 1
@@ -83,11 +84,11 @@ def test_without_arm_nothing_arms_and_no_axis_is_sent():
     mav = mavlink.MAVLink(None)
     kinds = {message.get_type() for frame in sent for message in mav.parse_buffer(frame) or ()}
     assert "HEARTBEAT" in kinds and not kinds & {"MANUAL_CONTROL", "RC_CHANNELS_OVERRIDE"}
-    assert runtime.reading.ready  # it knows where it is all the same
+    assert runtime.reading.ready  # its position is known nevertheless
 
 
 def test_an_older_firmware_is_steered_by_overrides_and_a_small_gain_too():
-    """The same thrusts, whatever carries the axes."""
+    """Thrusts do not depend on the message that carries the axes."""
     link = MavlinkLink(HEAVY)
     link._version, link._parameters = (4, 5), {"JS_GAIN_DEFAULT": 0.5, "JS_THR_GAIN": 1.0}
     other = MavlinkLink(HEAVY)
@@ -110,11 +111,12 @@ SURFACE = [
     ),
     mavlink.MAVLink_gps_global_origin_message(338103130, -1183938670, 0),
 ]
-"""What telemetry waits for: the barometers' pressure at the surface, and the origin."""
+"""Messages that telemetry waits for: the barometers' pressure at the surface, and the origin."""
 
 
 def test_axes_and_attitude_turn_from_its_frame_to_ours():
-    """Nose up and right side down in the autopilot's axes: pitch below zero, roll above; specific force points up."""
+    """Nose up and right side down in the autopilot's axes give negative pitch and positive roll; specific
+    force points up."""
     link = MavlinkLink(HEAVY)
     auto = mavlink.MAVLink(None, 1, 1)
     made = []
@@ -139,7 +141,7 @@ def test_axes_and_attitude_turn_from_its_frame_to_ours():
 
 
 def test_a_specific_force_beyond_the_instruments_range_is_left_out():
-    """The one before it is used on."""
+    """The previous value remains in use."""
     link, auto = MavlinkLink(HEAVY), mavlink.MAVLink(None, 1, 1)
     for z in (-1000, -32021):
         link.feed(1.0, bytes(mavlink.MAVLink_raw_imu_message(0, 0, 0, z, 0, 0, 0, 0, 0, 0).pack(auto)))
@@ -148,9 +150,10 @@ def test_a_specific_force_beyond_the_instruments_range_is_left_out():
 
 @pytest.mark.parametrize("mounted", [False, True])
 def test_its_own_velocity_counts_where_no_log_speaks(mounted):
-    """North 0.4 m/s with the nose north-east is forward and left; only while its filter says that it knows.
+    """0.4 m/s north with the nose north-east is forward and left; it counts only while the autopilot's filter is valid.
 
-    A log 0.2 m ahead whose x axis is to the left would read it so, and the vehicle's turn of 0.5 rad/s to the right.
+    A log 0.2 m ahead whose x axis points left would measure this velocity in its own axes, with that of the turn of
+    0.5 rad/s to the right.
     """
     vehicle, v = HEAVY, 0.4 / math.sqrt(2)
     if mounted:
@@ -176,25 +179,25 @@ ORIGIN = bytes(
         mavlink.MAVLink(None, 254, 1)
     )
 )
-"""Sent by another ground station."""
+"""Origin sent by another ground station."""
 
 
 def at(time, frame):
-    """What is sent once, at a time of the pool [s]."""
+    """Return a `meanwhile` that sends a frame once, at a time of the pool [s]."""
     waiting = [frame]
     return lambda pool: [waiting.pop()] if waiting and pool.time >= time else []
 
 
 def off(pool, goal):
-    """Distance from a goal, horizontal [m]."""
+    """Return the horizontal distance from a goal [m]."""
     return math.hypot(*(np.asarray(pool.plant.position[:2], float) - goal[:2]))
 
 
 @pytest.mark.slow
 def test_by_the_autopilots_own_position_alone():
-    """No Doppler log of ours: to 8 cm of the truth after 25 s, no pause, and every velocity accepted.
+    """Without a Doppler log of our own the error after 25 s is within 8 cm, without a pause or a rejected velocity.
 
-    That of a vehicle which rolls upright in the first second too: its filter is late by more than a log's noise.
+    A vehicle that rolls upright in the first second passes too: its filter lags by more than a log's noise.
     """
     goal = (0.8, 0.3, -2.2)
     ready = {"aiding_delay": 0.0, "origin": (33.8, -118.4)}
@@ -209,7 +212,8 @@ def test_by_the_autopilots_own_position_alone():
 @pytest.mark.slow
 @pytest.mark.parametrize("lag", [0.0, 0.25])
 def test_a_reset_of_the_autopilots_position_moves_nothing(lag):
-    """Its filter leaps by 0.7 m at 10 s, with a position that is late or not: noted, and the station is kept."""
+    """The autopilot's filter jumps by 0.7 m at 10 s, with or without lag: the jump is noted and the station
+    is kept."""
 
     def leap(pool):
         pool.faults.autopilot.position_lag = lag
@@ -226,7 +230,8 @@ def test_a_reset_of_the_autopilots_position_moves_nothing(lag):
 
 @pytest.mark.slow
 def test_an_origin_in_mid_run_turns_no_thrust():
-    """The heading turns by 11.4 degrees over 20 s: thrust pauses at once and resumes in the frame of the start."""
+    """The heading turns by 11.4 degrees over 20 s: thrust pauses at once and resumes in the frame of the
+    start."""
     rows = []
 
     def watch(pool):
@@ -241,14 +246,15 @@ def test_an_origin_in_mid_run_turns_no_thrust():
     kinds = [event.kind for event in runtime.counters.events]
     assert kinds.count("hold") == 1 and "fault" not in kinds and kinds.count("armed") == 2
     assert math.degrees(link._north - link._first_north) == pytest.approx(11.4, abs=2.5)
-    # World x is where the vehicle pointed at the start.
+    # World x is the vehicle's heading at the start.
     assert off(pool, (1.0, 0.3)) < 0.14
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("origin", [False, True])
 def test_goals_count_from_the_heading_of_the_start_without_an_origin(origin):
-    """The vehicle points 60 degrees to the left of north: 0.8 m ahead of it, or with an origin 0.8 m to the north."""
+    """The vehicle points 60 degrees left of north: the goal is 0.8 m ahead, or 0.8 m north if there is an
+    origin."""
     meanwhile = at(0.0, ORIGIN) if origin else None
     runtime, pool, _, _, _ = drive(16.0, goal=(0.8, 0.0, -2.2), meanwhile=meanwhile, yaw=math.radians(60.0))
     ahead = 0.0 if origin else math.radians(60.0)
@@ -260,9 +266,9 @@ def test_goals_count_from_the_heading_of_the_start_without_an_origin(origin):
 
 
 def turned_by(link, seconds, rate, scale=1.0, north=0.0, begin=(1.0, 0.0)):
-    """Feed a turning vehicle at 50 Hz; time and heading at the end, and whether the link ever paused.
+    """Feed a turning vehicle at 50 Hz; return time and heading at the end, and whether the link ever paused.
 
-    `rate` is the vehicle's [rad/s], of which the gyroscope shows `scale`; `north` turns the autopilot's [rad/s].
+    `rate` is the vehicle's [rad/s], of which the gyroscope shows `scale`; `north` turns the autopilot's north [rad/s].
     """
     (now, yaw), auto, paused = begin, mavlink.MAVLink(None, 1, 1), False
     for _ in range(round(50 * seconds)):
@@ -279,7 +285,7 @@ def turned_by(link, seconds, rate, scale=1.0, north=0.0, begin=(1.0, 0.0)):
 
 
 def test_a_compass_that_is_read_late_does_not_turn_the_frame_of_the_start():
-    """Without an origin world x is where the vehicle points, whatever its heading is called."""
+    """Without an origin world x is the vehicle's heading at the start, whatever the compass reads."""
     link, auto = MavlinkLink(HEAVY), mavlink.MAVLink(None, 1, 1)
     for message in SURFACE[:2]:
         link.feed(1.0, bytes(message.pack(auto)))
@@ -291,8 +297,8 @@ def test_a_compass_that_is_read_late_does_not_turn_the_frame_of_the_start():
 
 @pytest.mark.parametrize("scale", [0.96, 1.04])
 def test_a_long_spin_with_an_inexact_gyroscope_is_no_turn_of_the_north(scale):
-    """Ten turns at 73 deg/s, the recorded rate of a full stick: 4 % of them are 144 degrees. A turn of 11.4 degrees in
-    20 s afterwards is seen, and its end too."""
+    """Ten turns at 73 deg/s, the recorded rate of a full stick, with an error of 4 % give 144 degrees. A later turn of
+    north by 11.4 degrees in 20 s is detected, and its end too."""
     link, auto = MavlinkLink(HEAVY), mavlink.MAVLink(None, 1, 1)
     for message in SURFACE:
         link.feed(1.0, bytes(message.pack(auto)))
@@ -310,8 +316,8 @@ def test_a_long_spin_with_an_inexact_gyroscope_is_no_turn_of_the_north(scale):
 
 
 def test_a_goal_above_the_surface_by_the_pressure_is_refused_with_the_offset():
-    """Calibrated at 5 kPa less than the atmosphere, which is 0.51 m above the surface; a deeper goal, and a calibration
-    of this run, count."""
+    """Calibrated at 5 kPa below the atmosphere, which is 0.51 m above the surface; a deeper goal, or a calibration
+    during this run, is accepted."""
     link, auto = MavlinkLink(HEAVY), mavlink.MAVLink(None, 1, 1)
     for name in (b"BARO1_GND_PRESS", b"BARO2_GND_PRESS"):
         link.feed(1.0, bytes(mavlink.MAVLink_param_value_message(name, 96325.0, 9, 2, 0).pack(auto)))
@@ -330,7 +336,8 @@ def test_a_goal_above_the_surface_by_the_pressure_is_refused_with_the_offset():
 
 
 def test_a_quiet_instrument_has_not_frozen():
-    """Whole milli-g repeat for 2 s while attitude and rates go on; those alone, repeated, have frozen."""
+    """Whole milli-g may repeat for 2 s while attitude and rates change; attitude and rates that repeat are
+    frozen."""
     runtime = Runtime(HEAVY, Perception(HEAVY, None), make_pilot("pid", HEAVY), Station(START, 0.0))
     link, auto = MavlinkLink(HEAVY), mavlink.MAVLink(None, 1, 1)
     runtime.attach(link)
@@ -352,7 +359,7 @@ def test_a_quiet_instrument_has_not_frozen():
 
 
 def test_a_slow_simulation_is_named():
-    """Half of real time: said as such, and thrust waits."""
+    """A simulation at half of real time is reported as such, and thrust waits."""
     link, auto = MavlinkLink(HEAVY), mavlink.MAVLink(None, 1, 1)
     for k in range(200):
         now = 0.04 * k
@@ -367,7 +374,7 @@ def test_a_slow_simulation_is_named():
 
 @pytest.mark.slow
 def test_a_robot_that_starts_before_the_firmware_keeps_its_place():
-    """The firmware is silent for the first 4 s: where the vehicle was let in still counts."""
+    """The given start position still counts although the firmware is silent for the first 4 s."""
     begun = []
 
     def boot(pool):
@@ -382,7 +389,7 @@ def test_a_robot_that_starts_before_the_firmware_keeps_its_place():
 
 
 def test_telemetry_waits_for_the_pressure_at_the_surface():
-    """Depth would step when it comes; an autopilot that does not answer is waited for 3 s."""
+    """Otherwise depth would step when it arrives; an autopilot that does not answer is waited for 3 s."""
     auto = mavlink.MAVLink(None, 1, 1)
 
     def depths(answered):
@@ -405,7 +412,8 @@ def test_telemetry_waits_for_the_pressure_at_the_surface():
 
 @pytest.mark.slow
 def test_depth_is_calibrated_at_the_surface_before_arming():
-    """After a restart at 2 m depth counts from there, which is said; calibrated, the autopilot arms."""
+    """After a restart at 2 m, depth counts from there and this is reported; once calibrated, the autopilot
+    arms."""
     begun = []
 
     def boot(pool):
@@ -422,7 +430,7 @@ def test_depth_is_calibrated_at_the_surface_before_arming():
     )
     kinds = [event.kind for event in runtime.counters.events]
     assert kinds.count("armed") == 1 and "fault" not in kinds
-    assert pool.plant.position[2] == pytest.approx(-2.3, abs=0.15)  # 0.3 m below where it was calibrated
+    assert pool.plant.position[2] == pytest.approx(-2.3, abs=0.15)  # 0.3 m below the depth of calibration
 
 
 def test_only_an_autopilot_calibrates_its_depth():
@@ -434,7 +442,7 @@ def test_only_an_autopilot_calibrates_its_depth():
 
 
 def test_a_heartbeat_from_before_its_disarming_arms_no_bridge():
-    """Disarmed and asked for again at once: what it said a moment ago no longer holds."""
+    """After disarming and an immediate new request, an earlier heartbeat no longer counts as armed."""
     link, auto = MavlinkLink(HEAVY), mavlink.MAVLink(None, 1, 1)
     off = ThrusterCommand(False, (0.0,) * 8)
     armed = bytes(mavlink.MAVLink_heartbeat_message(12, 3, 209, 19, 4, 3).pack(auto))
@@ -443,14 +451,15 @@ def test_a_heartbeat_from_before_its_disarming_arms_no_bridge():
     assert link.prepare(10.0) == ""
     link.encode(10.0, off, "armed")
     link.encode(10.1, off, "disarmed")
-    link.feed(10.11, armed)  # on its way meanwhile
+    link.feed(10.11, armed)  # in transit meanwhile
     assert "disarm" in link.prepare(10.12)
     link.feed(10.3, bytes(mavlink.MAVLink_heartbeat_message(12, 3, 81, 19, 3, 3).pack(auto)))
     assert link.prepare(10.7) == "waiting for it to arm"
 
 
 def test_three_seconds_without_a_heartbeat_are_an_alarm():
-    """Armed and heard at 10 s: nothing at 12.9 s, whatever else arrives meanwhile, and an alarm at 13.1 s."""
+    """With the last heartbeat at 10 s there is no alarm at 12.9 s, despite other messages, and an alarm at
+    13.1 s."""
     link, auto = MavlinkLink(HEAVY), mavlink.MAVLink(None, 1, 1)
     link.feed(10.0, bytes(mavlink.MAVLink_heartbeat_message(12, 3, 209, 19, 4, 3).pack(auto)))
     link.feed(12.8, bytes(mavlink.MAVLink_attitude_message(10, 0, 0, 0, 0, 0, 0).pack(auto)))
@@ -501,7 +510,7 @@ def test_a_turned_imu_is_refused():
 
 
 def test_it_waits_for_parameters_but_not_for_ever():
-    """Whatever the clock says: three seconds from the first wish to arm; then axes go out as overrides."""
+    """Three seconds after the first request to arm, by any clock, axes are sent as overrides."""
     link, auto = MavlinkLink(HEAVY), mavlink.MAVLink(None, 1, 1)
     beat = mavlink.MAVLink_heartbeat_message(12, 3, 81, 19, 3, 3)
     for now, waits in ((5000.0, True), (5002.5, True), (5003.5, False)):

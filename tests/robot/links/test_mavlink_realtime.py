@@ -1,4 +1,4 @@
-"""A robot and an emulated ArduSub as a person starts them: two processes, UDP and TCP."""
+"""A robot and an emulated ArduSub as a user starts them: two processes, UDP and TCP."""
 
 import json
 import re
@@ -29,7 +29,7 @@ def until(condition, seconds=60.0):
 
 @pytest.mark.slow
 def test_a_pid_goes_to_its_goal_over_real_sockets(tmp_path, slow_clock):
-    """`finssim run --robot mavlink://...` beside `finssim pool --firmware ardusub`: armed, under way, disarmed."""
+    """`finssim run --robot mavlink://...` beside `finssim pool --firmware ardusub` arms, moves and disarms."""
     ground, truth = f"127.0.0.1:{free_port()}", tmp_path / "truth.fst"
     free = ["--port", "0", "--tcp", "127.0.0.1:0", "--dvl", "127.0.0.1:0", "--ground", ground]
     world = ["pool", "--firmware", "ardusub", "--truth", str(truth), *free, *VEHICLE]

@@ -1,4 +1,4 @@
-"""The page about the wire: its tables are those of the code, and its C reads what Python writes."""
+"""The tables of the wire page match the code, and its C reads what Python writes."""
 
 import re
 import shutil
@@ -26,7 +26,7 @@ OUTPUTS, ACTUATORS = 8, 4
 
 
 def table(layout: Layout) -> str:
-    """Rows of offset, type, name and meaning of every byte of a frame."""
+    """Return rows of offset, type, name and meaning of every byte of a frame."""
     form = forms(layout, OUTPUTS, ACTUATORS)[0]
     rows, at = (
         [("0", "1 byte" if len(layout.magic) == 1 else "2 bytes", "magic", layout.magic.hex(" ").upper())],
@@ -47,7 +47,7 @@ def table(layout: Layout) -> str:
 
 @pytest.mark.parametrize("layout", LAYOUTS, ids=lambda layout: layout.title)
 def test_the_table_of_a_frame_is_that_of_the_code(layout):
-    """Every byte, in the order in which the encoder writes and the decoder reads."""
+    """The table lists every byte in the order in which the encoder writes and the decoder reads."""
     assert table(layout) in PAGE
 
 
@@ -62,7 +62,7 @@ def test_the_flags_on_the_page_are_those_of_the_code():
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
 def test_the_firmware_on_the_page_reads_commands(tmp_path):
-    """Compiled, it takes a command, and refuses a wrong CRC, a wrong tail and what is no share of full speed."""
+    """The compiled C accepts a command, and refuses a wrong CRC, a wrong tail and a value beyond full speed."""
     (code,) = re.findall(r"^```c\n(.*?)^```", PAGE, flags=re.MULTILINE | re.DOTALL)
     code += """
 #include <stdio.h>

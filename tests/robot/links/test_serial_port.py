@@ -1,4 +1,5 @@
-"""A serial line that is pulled, plugged, stuck or taken, as a pseudo terminal; nothing raises or waits."""
+"""A serial line (a pseudo terminal) that is pulled, plugged, stuck or taken raises nothing and blocks
+nothing."""
 
 import os
 import select
@@ -14,7 +15,7 @@ pytestmark = pytest.mark.skipif(os.name != "posix", reason="pseudo terminals are
 
 
 class Line:
-    """A serial device at a fixed name: a pseudo terminal whose other end the test holds."""
+    """A serial device at a fixed name: a pseudo terminal whose other end belongs to the test."""
 
     def __init__(self, path):
         self.path, self.master = str(path), None
@@ -33,7 +34,7 @@ class Line:
         self.master = None
 
     def speed(self, transport):
-        """Baud rate that the terminal has been given."""
+        """Return the baud rate of the terminal."""
         import termios
 
         code = termios.tcgetattr(transport._port.fileno())[4]
@@ -55,7 +56,7 @@ def line(tmp_path):
 
 
 def test_a_frame_crosses_a_serial_line_in_pieces(line):
-    """The decoder puts together what the line takes apart; the command arrives as it was sent."""
+    """The decoder joins the pieces of the line; the command arrives as it was sent."""
     transport, decoder = open_transport(f"serial:{line.path}?baud=57600"), Decoder()
     assert transport.describe() == f"serial {line.path} at 57600 baud, connected"
     assert line.speed(transport) == 57600
@@ -75,7 +76,7 @@ def test_a_frame_crosses_a_serial_line_in_pieces(line):
 
 @pytest.mark.parametrize("notice", ["receive", "send"])
 def test_a_line_may_be_pulled_and_plugged_again(line, notice, caplog):
-    """Without it frames are counted and dropped; it is tried again a second later, not before."""
+    """While unplugged, frames are counted and dropped; reconnection is tried after a second, not before."""
     now = 100.0
     transport = SerialTransport(line.path, clock=lambda: now)
     line.unplug()
@@ -101,7 +102,7 @@ def test_a_line_may_be_pulled_and_plugged_again(line, notice, caplog):
 
 
 def test_a_stuck_line_holds_back_no_old_commands(line):
-    """Nobody reads: what has not left by then is dropped, so the past does not come out later and the newest does."""
+    """When the peer does not read, unsent commands are dropped: only the newest is sent later."""
     transport, sent = SerialTransport(line.path), 0
     while not transport.send_errors and sent < 1_000_000:
         transport.send(bytes(100))
@@ -111,14 +112,14 @@ def test_a_stuck_line_holds_back_no_old_commands(line):
     came = b""
     while select.select([line.master], [], [], 0.05)[0]:
         came += os.read(line.master, 65536)
-    assert len(came) < sent / 2  # what the terminal itself had taken in
+    assert len(came) < sent / 2  # what the terminal itself had buffered
     transport.send(b"newest")
     assert os.read(line.master, 100) == b"newest"
     transport.close()
 
 
 def test_a_device_belongs_to_one_program(line):
-    """A second opening of it is refused."""
+    """Opening it a second time is refused."""
     transport = SerialTransport(line.path)
     with pytest.raises(LinkError, match="cannot be opened"):
         SerialTransport(line.path)

@@ -1,4 +1,4 @@
-"""Wires: UDP with one peer alone, memory, nobody, and the addresses that name them; none raises or waits."""
+"""UDP with a single peer, memory and null transports, and their addresses; none raises or blocks."""
 
 import logging
 import select
@@ -21,7 +21,7 @@ def plain_socket():
 
 @pytest.fixture
 def ends():
-    """A transport, and a plain socket that is its peer."""
+    """A transport, and a plain socket as its peer."""
     peer = plain_socket()
     transport = UdpTransport((LOCAL, 0), peer.getsockname())
     yield transport, peer
@@ -30,13 +30,13 @@ def ends():
 
 
 def received(transport):
-    """What comes within a second; datagrams on loopback are there at once, but only almost."""
+    """Return what arrives within a second; datagrams on loopback are almost, but not quite, immediate."""
     select.select([transport._socket], [], [], 1.0)
     return transport.receive()
 
 
 def test_datagrams_go_to_the_peer_and_come_from_it(ends):
-    """A command out, two frames of telemetry in, oldest first; then nothing, without waiting."""
+    """One command goes out and two frames of telemetry come in, oldest first; then nothing, without waiting."""
     transport, peer = ends
     transport.send(encode_command(COMMAND))
     assert peer.recv(2048) == encode_command(COMMAND)
@@ -47,7 +47,7 @@ def test_datagrams_go_to_the_peer_and_come_from_it(ends):
 
 
 def test_a_stranger_is_refused_counted_and_named_once(ends, caplog):
-    """Another port of the same address is a stranger too; what the peer sends among it gets through."""
+    """Another port of the same address is also a stranger; datagrams of the peer in between are received."""
     transport, peer = ends
     with plain_socket() as stranger, caplog.at_level(logging.WARNING, "finssim.robot.links"):
         for _ in range(3):
@@ -62,7 +62,7 @@ def test_a_stranger_is_refused_counted_and_named_once(ends, caplog):
 
 
 def test_a_crowd_of_strangers_fills_neither_memory_nor_log(ends, caplog):
-    """Beyond 64 of them, the rest are counted together and named in one line."""
+    """Strangers beyond 64 are counted together and named in one line."""
     transport, _ = ends
     for _ in range(80):
         with plain_socket() as stranger:
@@ -74,7 +74,7 @@ def test_a_crowd_of_strangers_fills_neither_memory_nor_log(ends, caplog):
 
 
 def test_a_flood_does_not_hold_the_loop_up(ends):
-    """One call looks at 1024 datagrams at most."""
+    """One call reads at most 1024 datagrams."""
     transport, peer = ends
     transport._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 22)
     for _ in range(1100):
@@ -83,7 +83,7 @@ def test_a_flood_does_not_hold_the_loop_up(ends):
 
 
 def test_a_datagram_that_is_too_long_is_cut_and_then_no_frame(ends):
-    """2048 bytes of it are taken."""
+    """At most 2048 bytes of a datagram are read."""
     transport, peer = ends
     peer.sendto(bytes(5000), transport.address)
     (data,) = received(transport)
@@ -91,7 +91,7 @@ def test_a_datagram_that_is_too_long_is_cut_and_then_no_frame(ends):
 
 
 def test_sending_to_nobody_raises_nothing(ends):
-    """The peer has gone, and comes back at the same port: frames reach it again."""
+    """When the peer disappears and returns on the same port, frames reach it again."""
     transport, peer = ends
     address = peer.getsockname()
     peer.close()
@@ -105,7 +105,7 @@ def test_sending_to_nobody_raises_nothing(ends):
 
 
 def test_what_cannot_leave_is_counted_and_said_once(ends, caplog):
-    """A datagram that UDP has no room for, and a closed end."""
+    """A datagram too large for UDP and a closed end are counted and reported once."""
     transport, _ = ends
     transport.send(bytes(70_000))
     transport.send(bytes(70_000))
@@ -119,7 +119,7 @@ def test_what_cannot_leave_is_counted_and_said_once(ends, caplog):
 
 
 def test_it_is_bound_to_this_machine_unless_told_otherwise(ends):
-    """A vehicle elsewhere needs an address that is given; loopback would never reach it."""
+    """A vehicle elsewhere needs a given local address; loopback would never reach it."""
     _, peer = ends
     transport = open_transport(f"udp://localhost:{peer.getsockname()[1]}", bind=f"{LOCAL}:0")
     assert transport.address[0] == LOCAL
@@ -130,7 +130,7 @@ def test_it_is_bound_to_this_machine_unless_told_otherwise(ends):
 
 
 def test_a_second_robot_on_the_same_port_is_refused(ends):
-    """Two programs cannot both listen to one vehicle at one address."""
+    """Two programs cannot both listen to one vehicle on one address."""
     transport, peer = ends
     with pytest.raises(LinkError, match="cannot bind 127.0.0.1:.*end the program that has it"):
         UdpTransport(transport.address, peer.getsockname())
@@ -153,14 +153,15 @@ def test_a_second_robot_on_the_same_port_is_refused(ends):
     ],
 )
 def test_an_address_that_is_no_wire_is_refused(address, said):
-    """With a sentence that says what to give."""
+    """The sentence says which addresses are valid."""
     with pytest.raises(LinkError) as refused:
         open_transport(address, bind=f"{LOCAL}:0")
     assert said in str(refused.value)
 
 
 def test_what_goes_in_at_one_end_of_memory_comes_out_at_the_other():
-    """Both ways, in order, once; a closed end takes and gives nothing, and a full one loses the oldest."""
+    """Messages pass both ways, in order and once; a closed end neither accepts nor delivers, a full one drops
+    the oldest."""
     robot, vehicle = memory_pair()
     robot.send(b"a")
     robot.send(b"b")

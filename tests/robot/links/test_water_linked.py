@@ -1,4 +1,5 @@
-"""Water Linked DVL lines: the published example, our axes, ages, hostile input, and both ends of the connection."""
+"""Water Linked DVL lines: the published example, FinsSim's axes, ages, hostile input, and both ends of the
+connection."""
 
 import json
 import math
@@ -36,7 +37,7 @@ REPORT = {
     "velocity_valid": True, "tracking_mode": "bottom", "status": 0, "format": "json_v3.2", "type": "velocity",
     "time_of_validity": 1638191471563017, "time_of_transmission": 1638191471752336,
 }  # fmt: skip
-"""As the protocol's page has it, with velocities whose signs can be seen."""
+"""A report as in the protocol's documentation, with velocities large enough to check their signs."""
 
 
 def line(**changes):
@@ -44,7 +45,8 @@ def line(**changes):
 
 
 def test_the_published_report_becomes_a_velocity_in_our_axes_with_the_logs_own_age():
-    """Right and down of the log are left and up of ours, turned; 189.319 ms passed between reflection and sending."""
+    """Right and down of the log are left and up of the vehicle, rotated; 189.319 ms passed from reflection to
+    sending."""
     aid = decode_line(line())
     assert (aid.kind, aid.values) == (VELOCITY, (0.5, -0.25, 0.125))
     assert aid.age == pytest.approx(0.189319, abs=1e-9)
@@ -60,7 +62,8 @@ def test_the_published_report_becomes_a_velocity_in_our_axes_with_the_logs_own_a
     ],
 )
 def test_reports_of_old_firmware_are_velocities_without_an_age(version, without):
-    """Before json_v3 a report has no times, in json_v1 no type; without bottom lock it is none either way."""
+    """Before json_v3 reports have no times, in json_v1 no type; without bottom lock there is no velocity in
+    any version."""
     old = {key: value for key, value in REPORT.items() if key not in without}
     old |= {} if version is None else {"format": version}
     counts = Counter()
@@ -99,7 +102,7 @@ def test_a_report_of_new_firmware_needs_its_times(missing):
     ],
 )
 def test_what_is_no_velocity_over_the_floor_is_counted(changes, counted):
-    """Each with its reason, and nothing comes of it."""
+    """Each such report is counted by its reason and yields no velocity."""
     counts = Counter()
     assert decode_line(line(**changes), counts) is None
     assert counts == {counted: 1}
@@ -107,20 +110,21 @@ def test_what_is_no_velocity_over_the_floor_is_counted(changes, counted):
 
 @pytest.mark.parametrize("text", [b"", b"\xff", b"[1]", b"[" * 100_000, b"9" * 5000, line()[:-1], b"null"])
 def test_what_is_no_json_object_is_counted(text):
-    """Whatever the bytes are."""
+    """Any bytes that are not a JSON object are counted."""
     counts = Counter()
     assert decode_line(text, counts) is None
     assert counts == {"not a report": 1}
 
 
 def test_a_report_without_altitude_is_a_velocity():
-    """Neither altitude nor figure of merit decides on the velocity."""
+    """Neither altitude nor figure of merit affects validity."""
     aid = decode_line(line(altitude=-1, fom=10**400))
     assert math.isnan(aid.altitude) and math.isnan(aid.fom)
 
 
 def test_an_encoded_velocity_comes_back():
-    """Round trip, with the fields of the published report in their order and beams that see the velocity."""
+    """The report has the fields of the published one, in their order, and beam velocities that match the
+    velocity."""
     data = encode_velocity([0.5, -0.25, 0.125], altitude=0.495, measured=1e9, sent=1e9 + 0.19, interval=0.1)
     report, aid = json.loads(data), decode_line(data)
     assert data.endswith(b"}\n") and data.count(b"\n") == 1
@@ -130,14 +134,14 @@ def test_an_encoded_velocity_comes_back():
     assert aid.values == (0.5, -0.25, 0.125)
     assert aid.age == pytest.approx(0.19, abs=1e-6)
     assert aid.altitude == 0.495
-    # Opposite beams: their mean is the part along z, their sum of all the horizontal ones is nothing.
+    # The mean of opposite beams is the component along z; the horizontal components of all beams add up to zero.
     beams = [beam["velocity"] for beam in report["transducers"]]
     assert np.mean(beams) == pytest.approx(-0.125 * math.cos(math.radians(22.5)))
     assert report["transducers"][0]["distance"] == pytest.approx(0.495 / math.cos(math.radians(22.5)))
 
 
 def test_a_lost_bottom_is_sent_as_a_log_sends_it():
-    """Zeros, altitude and distances of -1, no valid beam."""
+    """Without bottom lock: zeros, altitude and distances of -1, no valid beam."""
     report = json.loads(encode_velocity(None, measured=1.0, sent=1.2, interval=0.1))
     assert (report["vx"], report["altitude"], report["velocity_valid"]) == (0.0, -1.0, False)
     assert all(b["distance"] == -1.0 and b["beam_valid"] is False for b in report["transducers"])
@@ -161,7 +165,7 @@ WORDS = (
 
 
 def mutated(source: random.Random, data: bytes) -> bytes:
-    """One to three changes: of a value, or of some bytes."""
+    """Return data with one to three changes of a value or of some bytes."""
     for _ in range(source.randint(1, 3)):
         if source.random() < 0.7:
             values = [*re.finditer(rb'(?<=":)[^,\[\]{}]+', data)]
@@ -177,7 +181,7 @@ def mutated(source: random.Random, data: bytes) -> bytes:
 
 
 def fuzz(lines: int, seed: int = 0) -> Counter:
-    """What becomes of mutated lines; values that get through are always plausible."""
+    """Count the outcomes of mutated lines; accepted values must be plausible."""
     source, counts = random.Random(seed), Counter()
     lost = encode_velocity(None, measured=1.0, sent=1.2, interval=0.1)
     whole = [
@@ -193,7 +197,7 @@ def fuzz(lines: int, seed: int = 0) -> Counter:
 
 
 def test_no_mutated_line_upsets_the_reader():
-    """Three thousand of them at every run; `python -m robot.links.test_water_linked` does a hundred thousand."""
+    """Three thousand lines per run; `python -m robot.links.test_water_linked` tries a hundred thousand."""
     assert fuzz(3000)["velocity"] > 100
 
 
@@ -205,7 +209,7 @@ def server():
 
 
 def received(client, server, many=1, within=5.0):
-    """Lines of the client, with the server looked after, until there are as many."""
+    """Return the client's lines once this many have arrived, serving the server meanwhile."""
     found, end = [], time.monotonic() + within
     while len(found) < many and time.monotonic() < end:
         server.poll()
@@ -223,7 +227,7 @@ def connected(server):
 
 
 def test_reports_reach_several_clients_as_whole_lines(server):
-    """Whatever pieces TCP makes of them."""
+    """Lines are whole however TCP splits them."""
     clients = [connected(server), connected(server)]
     server.poll()
     data = encode_velocity([0.1, 0.2, 0.3], altitude=1.0, measured=1.0, sent=1.2, interval=0.1)
@@ -236,7 +240,7 @@ def test_reports_reach_several_clients_as_whole_lines(server):
 
 
 def asked(client, server, command, **parameters):
-    """Response to a command."""
+    """Return the response to a command."""
     request = {"command": command} | ({"parameters": parameters} if parameters else {})
     client.send(json.dumps(request).encode() + b"\n")
     (answer,) = received(client, server)
@@ -244,7 +248,7 @@ def asked(client, server, command, **parameters):
 
 
 def test_a_driver_configures_the_log(server):
-    """Settings are taken all or none, and come back; what is no command or no setting is refused by name."""
+    """Settings are applied all or none and read back; unknown commands and settings are refused by name."""
     client, counts = connected(server), Counter()
     assert asked(client, server, "set_config", speed_of_sound=1500, range_mode="=2")["success"] is True
     answer = asked(client, server, "get_config")
@@ -262,7 +266,8 @@ def test_a_driver_configures_the_log(server):
 
 
 def test_settings_change_what_is_measured(server):
-    """The speed of sound scales, the mounting offset turns, and without acoustics nothing comes."""
+    """The speed of sound scales velocities, the mounting offset rotates them, and without acoustics there are
+    none."""
     client = connected(server)
     data = encode_velocity([0.5, 0.0, 0.0], altitude=2.0, measured=1.0, sent=1.1, interval=0.1)
     asked(client, server, "set_config", speed_of_sound=1475 * 1.02, mounting_rotation_offset=90)
@@ -277,7 +282,7 @@ def test_settings_change_what_is_measured(server):
 
 
 def test_dead_reckoning_counts_from_its_reset(server):
-    """A quarter of a circle to the left, 5 reports a second; after a reset x is ahead and the heading 0."""
+    """A quarter circle to the left at 5 reports a second; after a reset x is ahead and the heading 0."""
     client, reckoning, reports = connected(server), DeadReckoning(), []
     radius, speed = 2.0, 0.5
     for k in range(round(0.5 * math.pi * radius / speed * 10) + 1):
@@ -310,7 +315,7 @@ def test_beams_lie_where_the_log_has_them():
 
 
 def test_blueos_finds_the_log_by_its_page():
-    """The name contains DVL; other pages are not there."""
+    """The name contains DVL; other pages do not exist."""
     server = serve_about(("127.0.0.1", 0))
     try:
         address = "http://{}:{}".format(*server.server_address)
@@ -324,7 +329,7 @@ def test_blueos_finds_the_log_by_its_page():
 
 
 def test_a_lost_log_is_found_again_without_waiting():
-    """Nobody there, then somebody, who leaves and comes back; no call takes as long as one turn of the robot's loop."""
+    """The log is absent, appears, leaves and returns; no call takes as long as one turn of the robot's loop."""
     server = DvlServer(("127.0.0.1", 0))
     address, now = server.address, [0.0]
     server.close()
@@ -347,7 +352,7 @@ def test_a_lost_log_is_found_again_without_waiting():
 
 
 def test_a_silent_log_is_left(server):
-    """A pulled cable ends no connection: five seconds without a byte do."""
+    """A pulled cable does not close the connection, so five seconds without a byte do."""
     now = [0.0]
     client = DvlClient(*server.address, clock=lambda: now[0])
     for _ in range(100):
@@ -371,7 +376,7 @@ def test_a_line_without_end_is_dropped(server, monkeypatch):
 
 
 def test_a_client_that_does_not_read_is_let_go(server):
-    """It holds nobody up."""
+    """A client that does not read is disconnected and delays no other client."""
     lazy = socket.create_connection(server.address)
     client = connected(server)
     server.poll()
@@ -385,7 +390,7 @@ def test_a_client_that_does_not_read_is_let_go(server):
 
 
 def test_a_port_that_is_taken_and_a_host_that_is_not_there_are_refused(server):
-    """With what to do."""
+    """The refusals say what to do."""
     with pytest.raises(LinkError, match="give another port"):
         DvlServer(server.address)
     with pytest.raises(LinkError, match="no such host"):

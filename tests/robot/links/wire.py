@@ -1,4 +1,5 @@
-"""Frames packed by hand, without the table of fields, and a CRC bit by bit: what the tests of the link compare with."""
+"""Frames packed by hand, without the table of fields, and a bitwise CRC, as references for the tests of the
+link."""
 
 import math
 import struct
@@ -10,7 +11,7 @@ from finssim.robot.messages import CommandEcho, Telemetry, ThrusterCommand
 
 
 def crc_bitwise(data: bytes) -> int:
-    """CRC16-MODBUS as the standard has it: initial value 0xFFFF, polynomial 0xA001, bit by bit."""
+    """Return the CRC16-MODBUS as in the standard: initial value 0xFFFF, polynomial 0xA001, bit by bit."""
     crc = 0xFFFF
     for byte in data:
         crc ^= byte
@@ -23,11 +24,11 @@ def crc_bitwise(data: bytes) -> int:
 
 
 BYTES = tuple(crc_bitwise(bytes([0xFF ^ byte])) ^ 0xFF for byte in range(256))
-"""What one byte in an empty register leaves; 0xFF in its lower half is what the initial value put there."""
+"""Register after one byte in an empty register; 0xFF in its lower half comes from the initial value."""
 
 
 def crc_bytewise(data: bytes) -> int:
-    """The same with eight steps at once, for fuzzing."""
+    """Return the same CRC, eight steps at once, for fuzzing."""
     crc = 0xFFFF
     for byte in data:
         crc = (crc >> 8) ^ BYTES[(crc ^ byte) & 0xFF]
@@ -125,7 +126,7 @@ def debug_configs():
 
 
 def sealed(frame: bytes) -> bytes:
-    """The same bytes with a right CRC, for whatever kind of frame they seem to be."""
+    """Return the frame with a valid CRC, for the kind of frame that it appears to be."""
     head, tail = (1, 1) if frame[:1] == b"\xaa" else (2, 0)
     if len(frame) < head + 2 + tail:
         return frame
@@ -134,7 +135,8 @@ def sealed(frame: bytes) -> bytes:
 
 
 def frame_at(stream: bytes, at: int, side: str, outputs: int = 8):
-    """Reads one frame by hand: its length (0: none begins here) and its message (None: a number is not finite)."""
+    """Read one frame by hand; return its length (0: none begins here) and message (None: a number is not
+    finite)."""
     if side == "mcu" and stream[at] == 0xAA:
         return _read(stream, at, 1, f"<B{outputs}f", 1, _command)
     magic = b"\xa5\x5a" if side == "host" else b"\xac\xca"
@@ -184,7 +186,8 @@ def _debug_config(v):
 
 
 def frames_in(stream: bytes, side: str, outputs: int = 8):
-    """All messages of a stream, found by trying every byte as a beginning; what a decoder must find."""
+    """Return all messages of a stream, the reference for decoders, by trying every byte as the beginning of a
+    frame."""
     at, found = 0, []
     while at < len(stream):
         size, message = frame_at(stream, at, side, outputs)
