@@ -45,14 +45,16 @@ def test_the_plants_of_the_protocol_ship():
 def test_a_plant_is_seen_with_what_is_asked_for():
     """Sensors replace the plant's noise; the environment contains them, and the result says so."""
     assert load_plant("sensors").environment_arguments()["noise"] == Sensing()
-    seen = load_plant("noise").with_view("sensors")
+    seen = load_plant("noise").with_observation("sensors")
     assert seen.observe == "sensors" and not seen.noise and seen.title.endswith("; observation: sensors")
-    assert load_plant("nominal").with_view("truth").environment_arguments()["noise"] == MeasurementNoise()
+    assert (
+        load_plant("nominal").with_observation("truth").environment_arguments()["noise"] == MeasurementNoise()
+    )
     told = seen.observe_record(FINSROV)["observe"]
     assert told["name"] == "sensors" and told["fixes"]["rate"] == 30.0 and told["imu"]["rate"] == 100.0
     assert load_plant("noise").observe_record(FINSROV) == {}
     with pytest.raises(PlantError, match="observe is 'eyes', expected truth, estimator, sensors"):
-        load_plant("nominal").with_view("eyes")
+        load_plant("nominal").with_observation("eyes")
     with pytest.raises(ValueError, match="noise and observe: sensors are both given"):
         PlantChanges(name="both", noise={"yaw_std": 0.1}, observe="sensors")
 

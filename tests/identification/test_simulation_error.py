@@ -330,7 +330,7 @@ def test_a_gyro_without_velocity_gives_the_axes_of_rotation():
     some = [next(t for t in some if t.name.startswith(axis)) for axis in ("surge", "roll", "yaw")]
     fit = fit_by_simulation(without(some, "u", "v", "w", "x", "y", "z", "depth"), vehicle)
     assert {n.partition(".")[0] for n in fit.estimates if "." in n} == {"roll", "yaw"}
-    assert ("axis_untold", "surge") in {(one.code, one.subject) for one in fit.findings}
+    assert ("axis_undetermined", "surge") in {(one.code, one.subject) for one in fit.findings}
 
 
 @pytest.mark.slow

@@ -89,16 +89,16 @@ def test_a_good_trial_is_usable_and_tells_its_axis(simulated, name):
     found = report(simulated[name])
     assert found.verdict == "usable", found.findings
     mine = axis(simulated[name], name)
-    assert mine.excited and all(mine.tells[p].can for p in ("m_eff", "d1", "d2"))
+    assert mine.excited and all(mine.identifiability[p].identifiable for p in ("m_eff", "d1", "d2"))
     idle = axis(simulated[name], "sway")
-    assert not idle.excited and not any(told.can for told in idle.tells.values())
+    assert not idle.excited and not any(told.identifiable for told in idle.identifiability.values())
 
 
 def test_a_dive_and_coast_tells_buoyancy_and_a_roll_pulse_the_restoring_moment(simulated):
     """What only these trials can tell."""
-    assert axis(simulated["heave"], "heave").tells["buoyancy"].can
-    assert axis(simulated["roll"], "roll").tells["k"].can
-    assert "k" not in axis(simulated["yaw"], "yaw").tells
+    assert axis(simulated["heave"], "heave").identifiability["buoyancy"].identifiable
+    assert axis(simulated["roll"], "roll").identifiability["k"].identifiable
+    assert "k" not in axis(simulated["yaw"], "yaw").identifiability
 
 
 WRONG = {
@@ -214,17 +214,17 @@ def test_five_hertz_with_wrench_and_velocity_only(simulated):
     )
     trial = changed(trial, header={"inputs": "commanded"})
     assert report(trial).verdict == "usable", report(trial).findings
-    told = axis(trial, "surge").tells
-    assert told["m_eff"].can and told["d2"].can
-    assert "no velocity: neither v nor x, y" in axis(trial, "sway").tells["m_eff"].why
+    told = axis(trial, "surge").identifiability
+    assert told["m_eff"].identifiable and told["d2"].identifiable
+    assert "no velocity: neither v nor x, y" in axis(trial, "sway").identifiability["m_eff"].reason
 
 
 def test_gyro_without_velocity_tells_the_turns_only(simulated):
     """No u, v, w, no position: yaw from the gyroscope, surge from nothing."""
     gone = dict.fromkeys(("u", "v", "w", "x", "y", "z", "depth", "roll", "pitch", "yaw"))
-    assert axis(changed(simulated["yaw"], **gone), "yaw").tells["d1"].can
+    assert axis(changed(simulated["yaw"], **gone), "yaw").identifiability["d1"].identifiable
     trial = changed(simulated["surge"], **gone)
-    assert not any(told.can for told in axis(trial, "surge").tells.values())
+    assert not any(told.identifiable for told in axis(trial, "surge").identifiability.values())
 
 
 def test_one_level_without_a_coast_cannot_part_linear_and_quadratic_drag(simulated):
@@ -240,10 +240,10 @@ def test_one_level_without_a_coast_cannot_part_linear_and_quadratic_drag(simulat
         phase=None,
         channels={c: v[steady] for c, v in trial.channels.items()},
     )
-    told = axis(trial, "surge").tells
+    told = axis(trial, "surge").identifiability
     assert np.ptp(trial.series("u")[1]) < 0.2 * np.ptp(u)
-    assert not told["d1"].can and not told["d2"].can and not told["m_eff"].can
-    assert "only their sum" in told["d2"].why
+    assert not told["d1"].identifiable and not told["d2"].identifiable and not told["m_eff"].identifiable
+    assert "only their sum" in told["d2"].reason
 
 
 def test_a_passive_trial_tells_against_the_restoring_moment_only(simulated):
@@ -252,10 +252,10 @@ def test_a_passive_trial_tells_against_the_restoring_moment_only(simulated):
     roll = 0.3 * np.exp(-0.3 * t) * np.cos(3.0 * t)
     channels = {"roll": roll, "pitch": 0.0 * t, "p": np.gradient(roll, t), "q": 0.0 * t, "r": 0.0 * t}
     trial = Trial(name="swing", t=t, channels=channels, header=Header(passive=True))
-    told = axis(trial, "roll").tells
-    assert told["m_eff"].can and "restoring moment" in told["m_eff"].why
-    assert not told["k"].can
-    assert not axis(trial, "surge").tells["m_eff"].can
+    told = axis(trial, "roll").identifiability
+    assert told["m_eff"].identifiable and "restoring moment" in told["m_eff"].reason
+    assert not told["k"].identifiable
+    assert not axis(trial, "surge").identifiability["m_eff"].identifiable
 
 
 def test_the_check_of_a_passive_trial_agrees_with_the_fit():
@@ -266,7 +266,7 @@ def test_the_check_of_a_passive_trial_agrees_with_the_fit():
         (np.full(12, 0.6), "yaw does not coast to a lower speed"),
     ):
         trial = Trial(name="spin", t=t, channels={"r": rate}, header=Header(passive=True))
-        assert axis(trial, "yaw").tells["d1"].why.startswith(reason)
+        assert axis(trial, "yaw").identifiability["d1"].reason.startswith(reason)
         assert axis(trial, "yaw").excited is not bool(reason)
         if reason:
             with pytest.raises(CalibrationError, match=reason):
@@ -399,7 +399,7 @@ def test_between_trials(simulated):
     )
     assert said(set_findings(mixed), "several_vehicles") == [{"vehicles": ("bluerov2", "finsrov")}]
     good = set_findings(check_trials([surge, changed(yaw, header={"role": "held-out"})], VEHICLE))
-    assert {"sway", "yaw"} <= set(said(good, "axes_untold")[0]["axes"])
+    assert {"sway", "yaw"} <= set(said(good, "axes_undetermined")[0]["axes"])
 
 
 @pytest.mark.slow
@@ -407,7 +407,7 @@ def test_the_report_is_json_and_fits_a_hundred_columns(simulated):
     """Programs get plain finite values; people lines that do not wrap."""
     reports = check_trials(list(simulated.values()), VEHICLE)
     text = json.dumps({"trials": [one.as_json() for one in reports]}, allow_nan=False)
-    assert json.loads(text)["trials"][0]["axes"]["surge"]["tells"]["m_eff"]["can"] is True
+    assert json.loads(text)["trials"][0]["axes"]["surge"]["identifiability"]["m_eff"]["identifiable"] is True
     for width in (100, 80):
         page = StringIO()
         print_reports(reports, Console(file=page, width=width), set_findings(reports))

@@ -155,7 +155,7 @@ class CourseData:
 
 
 @wp.struct
-class CourseOrder:
+class CourseReference:
     """Reference of the autopilot."""
 
     speed: float  # requested surge velocity [m/s]
@@ -166,7 +166,7 @@ class CourseOrder:
 
 
 @wp.struct
-class CourseAnswer:
+class CourseCommand:
     """Commands of the autopilot, and its memory."""
 
     channels: vec8
@@ -183,7 +183,7 @@ def between(low: Any, high: Any, share: float):
 
 
 @wp.func
-def nothing_known() -> Memory:
+def initial_memory() -> Memory:
     """Return the initial memory [m, rad s, N, N m, m/s], with an unknown current."""
     memory = Memory()
     memory[9] = wp.nan
@@ -234,7 +234,7 @@ def level_motion(q: wp.quat, nu: vec6, memory: Memory) -> LevelMotion:
 
 
 @wp.func
-def among_speeds(speed: float, vehicle: int, data: CourseData) -> float:
+def speed_index(speed: float, vehicle: int, data: CourseData) -> float:
     """Return the fractional index of a speed [m/s] among those of a vehicle's model: 0 is the lowest, 1 the
     next [-]."""
     count = data.trim.shape[1]
@@ -246,7 +246,7 @@ def place_of(surge: float, by_pitch: int, vehicle: int, data: CourseData) -> Pla
     """Return the interpolation point of a speed through the water [m/s]; `by_pitch` is 1 to hold the pitch,
     otherwise 0."""
     count = data.trim.shape[1]
-    place = among_speeds(surge, vehicle, data)
+    place = speed_index(surge, vehicle, data)
     found = Place()
     found.k = wp.min(int(place), count - 2)
     found.s = place - float(found.k)
@@ -256,7 +256,7 @@ def place_of(surge: float, by_pitch: int, vehicle: int, data: CourseData) -> Pla
 
 
 @wp.func
-def heading_error(order: CourseOrder, level: LevelMotion, vehicle: int, data: CourseData) -> float:
+def heading_error(order: CourseReference, level: LevelMotion, vehicle: int, data: CourseData) -> float:
     """Return the heading minus the one that achieves the requested course in the current [rad]; not wrapped."""
     least = data.first[vehicle]
     course = float(level.heading)
@@ -269,7 +269,9 @@ def heading_error(order: CourseOrder, level: LevelMotion, vehicle: int, data: Co
 
 
 @wp.func
-def errors_of(order: CourseOrder, q: wp.quat, nu: vec6, memory: Memory, off: float, reach: Wrench4) -> Row:
+def errors_of(
+    order: CourseReference, q: wp.quat, nu: vec6, memory: Memory, off: float, reach: Wrench4
+) -> Row:
     """Return the state in the feedback, and the lagged wrench [m/s, rad/s, rad, m, N, N m].
 
     Args:
@@ -302,7 +304,7 @@ def errors_of(order: CourseOrder, q: wp.quat, nu: vec6, memory: Memory, off: flo
 def demanded(speed: float, x: Row, at: Place, vehicle: int, data: CourseData) -> Wrench4:
     """Return the demanded wrench (X, K, M, N) [N, N m]; the requested surge velocity `speed` is in [m/s]."""
     k = at.k
-    goal = among_speeds(speed, vehicle, data)
+    goal = speed_index(speed, vehicle, data)
     k_goal = wp.min(int(goal), data.trim.shape[1] - 2)
     wrench = Wrench4()
     for i in range(4):
@@ -315,7 +317,7 @@ def demanded(speed: float, x: Row, at: Place, vehicle: int, data: CourseData) ->
 
 @wp.func
 def grown_integrals(
-    order: CourseOrder, x: Row, short: Wrench4, memory: Memory, at: Place, vehicle: int, data: CourseData
+    order: CourseReference, x: Row, short: Wrench4, memory: Memory, at: Place, vehicle: int, data: CourseData
 ) -> Memory:
     """Return the memory with updated integrals, except those that the channels cannot follow.
 
@@ -336,15 +338,15 @@ def grown_integrals(
 
 @wp.func
 def steer(
-    order: CourseOrder, q: wp.quat, nu: vec6, memory: Memory, vehicle: int, data: CourseData
-) -> CourseAnswer:
+    order: CourseReference, q: wp.quat, nu: vec6, memory: Memory, vehicle: int, data: CourseData
+) -> CourseCommand:
     """Return the channels that execute a reference, and the memory for the next call.
 
     Args:
         order: Reference.
         q: Attitude, body to world.
         nu: Velocity over ground, body frame [m/s, rad/s].
-        memory: Memory after the previous command [m, rad s, N, N m, m/s]; `nothing_known` initially.
+        memory: Memory after the previous command [m, rad s, N, N m, m/s]; `initial_memory` initially.
         vehicle: First index into `data`.
         data: Numbers from `course_data`.
     """
@@ -363,7 +365,7 @@ def steer(
         achieved += (1.0 - s) * low[i] * data.columns[vehicle, k, i]
         achieved += s * high[i] * data.columns[vehicle, k + 1, i]
 
-    answer = CourseAnswer()
+    answer = CourseCommand()
     answer.channels = between(data.trim[vehicle, k] + low, data.trim[vehicle, k + 1] + high, s)
     after = grown_integrals(order, x, wrench - achieved, memory, at, vehicle, data)
     for i in range(4):
@@ -385,7 +387,7 @@ def steer(
 @wp.func
 def order_of(
     speed: float, turn: float, dive: float, by_pitch: int, vehicle: int, data: CourseData
-) -> CourseOrder:
+) -> CourseReference:
     """Return the reference for an action of mode `course` or `course_pitch`.
 
     Args:
@@ -396,7 +398,7 @@ def order_of(
         vehicle: First index into `data`.
         data: Numbers from `course_data`.
     """
-    order = CourseOrder()
+    order = CourseReference()
     whole = data.spacing[vehicle] * float(data.trim.shape[1] - 1)
     order.speed = data.first[vehicle] + 0.5 * (1.0 + wp.clamp(speed, -1.0, 1.0)) * whole
     order.turn = wp.static(WIDEST) * wp.clamp(turn, -1.0, 1.0)
@@ -410,7 +412,7 @@ def order_of(
 
 @wp.kernel(enable_backward=False)
 def steer_rows(
-    orders: wp.array(dtype=CourseOrder),
+    orders: wp.array(dtype=CourseReference),
     q: wp.array(dtype=wp.quat),
     nu: wp.array(dtype=vec6),
     memory: wp.array(dtype=Memory),
@@ -705,7 +707,7 @@ class CoursePilot:
         return self._carry_out(orders, measured, memory)
 
     def _orders(self, n: int) -> Any:
-        struct: Any = CourseOrder
+        struct: Any = CourseReference
         return np.zeros(n, dtype=struct.numpy_dtype())
 
     def _carry_out(self, orders: Any, measured: Measured, memory: Array) -> tuple[Array, Array]:
@@ -713,7 +715,7 @@ class CoursePilot:
         n = len(q)
         rows = ((q, wp.quat), (nu, vec6), (memory, Memory))
         given: list[Any] = [wp.array(x.astype(np.float32), dtype=kind, device="cpu") for x, kind in rows]
-        given.insert(0, wp.array(orders, dtype=CourseOrder, device="cpu"))
+        given.insert(0, wp.array(orders, dtype=CourseReference, device="cpu"))
         out = [wp.zeros(n, dtype=kind, device="cpu") for kind in (vec8, Memory)]
         wp.launch(steer_rows, n, [*given, self.data, *out], device="cpu")
         channels, after = (array.numpy().astype(float) for array in out)

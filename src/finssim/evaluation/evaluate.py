@@ -377,7 +377,7 @@ def evaluate_in_plants(
     task, vehicle = _subject(Path(names[0]), task, vehicle)
     task_named(task)  # refuses an unknown task
     plants = [] if records else _plants([plant] if isinstance(plant, str | Path) else plant)
-    plants = plants if observe is None else [plant_file.with_view(observe) for plant_file in plants]
+    plants = plants if observe is None else [plant_file.with_observation(observe) for plant_file in plants]
     with atomic_directory(out, replaces=EVALUATION_FILE) if out is not None else nullcontext() as folder:
         evaluations = [_recorded(records, task, vehicle, trajectories, truth)] if records else []
         for plant_file in plants:

@@ -31,9 +31,9 @@ from finssim.evaluation.robot_trials import (
     TrialOutcome,
     check_starts,
     noise_seed,
+    open_results_folder,
     play_in_pool,
     session,
-    take_folder,
 )
 from finssim.identification.manoeuvres import manoeuvres, simulate_manoeuvres, write_manoeuvre
 from finssim.identification.programme import Programme, programmes, read_legs, write_programme
@@ -653,14 +653,16 @@ def _excite_in_simulation(
         if pool is not None:
             drawn_around, severity = simulation.pool_vehicle or vehicle, simulation.severity or "realistic"
             about = {"vehicle": load_vehicle(drawn_around).name, "plant": pool, "severity": severity}
-            take_folder(folder / PLAN_FILE, _about(body, played, seed, plan.kind, {"pool": about}))
+            open_results_folder(folder / PLAN_FILE, _about(body, played, seed, plan.kind, {"pool": about}))
             with progress_bar("playing programmes") as progress:
                 record_programmes(
                     {"fit": played}, {"fit": folder}, vehicle, pool_vehicle=drawn_around, plant=pool,
                     severity=severity, seed=seed, progress=progress, show=_show_left_out,
                 )  # fmt: skip
         else:
-            take_folder(folder / PLAN_FILE, _about(body, played, seed, plan.kind, {"simulated": simulate}))
+            open_results_folder(
+                folder / PLAN_FILE, _about(body, played, seed, plan.kind, {"simulated": simulate})
+            )
             trials = simulate_programme(played, body, seed=seed, inputs=simulation.inputs) if simulate else ()
             for trial in trials:
                 write_trial(trial, folder / trial.name)
@@ -692,7 +694,7 @@ def _excite_by_course(vehicle: Vehicle, out: Path, *, simulate: bool, seed: int)
             "manoeuvres": [one.name for one in chosen],
             "simulated": simulate,
         }
-        take_folder(folder / PLAN_FILE, about)
+        open_results_folder(folder / PLAN_FILE, about)
         for trial in trials:
             write_trial(trial, folder / trial.name)
         for one in () if simulate else chosen:
@@ -747,7 +749,7 @@ def excite_on_robot(
     start_warp()
     body = load_vehicle(vehicle)
     played = plan.programmes(axes, body, seed)
-    take_folder(Path(out) / PLAN_FILE, _about(body, played, seed, plan.kind, {"robot": True}))
+    open_results_folder(Path(out) / PLAN_FILE, _about(body, played, seed, plan.kind, {"robot": True}))
     return record_programmes({"fit": played}, {"fit": Path(out)}, vehicle, robot, console=console)["fit"]
 
 

@@ -71,7 +71,7 @@ class PlantChanges(BaseModel):
             raise ValueError(f"noise and observe: {self.observe} are both given, expected one of them")
         return self
 
-    def with_view(self, observe: str) -> PlantChanges:
+    def with_observation(self, observe: str) -> PlantChanges:
         """Return the same plant with another observation.
 
         Raises:

@@ -563,7 +563,7 @@ def session(robot: OnRobot, vehicle: Vehicle, *, console: Console | None = None)
         yield Session(robot, vehicle, site, drive, attendant, console)
 
 
-def take_folder(file: Path, about: Mapping[str, Any]) -> None:
+def open_results_folder(file: Path, about: Mapping[str, Any]) -> None:
     """Start a folder in which results are stored as they are completed, or continue one with equal settings.
 
     Args:

@@ -210,7 +210,7 @@ class Adaptation:
         mean[-2:] = 0.0  # a current changes from one window to the next
         covariance[-2:], covariance[:, -2:] = 0.0, 0.0
         covariance[-2:, -2:] = self._prior[-2:, -2:]
-        J, b = self._learned(window)
+        J, b = self._window_information(window)
         size, along, y = _whitened(_root(covariance), J, b - J @ mean)
         if float(np.max(y**2 * size / (1.0 + size))) > UNLIKE:
             self.renewed.append(self.windows + 1)
@@ -221,7 +221,7 @@ class Adaptation:
         self.covariance = root @ np.diag(1.0 / (1.0 + size)) @ root.T
         self.windows += 1
 
-    def _learned(self, window: Sequence[Segment]) -> tuple[Array, Array]:
+    def _window_information(self, window: Sequence[Segment]) -> tuple[Array, Array]:
         """Return the information J of a window, and J x for the solution x of the window alone."""
         n, std = len(self.names), np.sqrt(np.diag(self._prior))
         unknowns: Any = _Coordinates(self, self._start, std)
@@ -237,11 +237,11 @@ class Adaptation:
         right = own @ y / alike  # (1 + J) y = J y of the data alone
         J, right = J / np.outer(std, std), right / std + J @ (self._start / std) / std
         # The information of a window is limited by the model error: (J⁻¹ + Q)⁻¹.
-        discrepancy = self._discrepancy + self._standing(window)
+        discrepancy = self._discrepancy + self._unfollowed_fraction(window)
         worse = np.linalg.inv(np.eye(n) + J @ np.diag(discrepancy**2))
         return worse @ J, worse @ right
 
-    def _standing(self, window: Sequence[Segment]) -> Array:
+    def _unfollowed_fraction(self, window: Sequence[Segment]) -> Array:
         """Return the fraction of each thruster's commands in a window that its motor may not follow, (P,); 0
         elsewhere.
 

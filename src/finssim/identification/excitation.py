@@ -85,7 +85,7 @@ def excitations(trials: Sequence[Streams], vehicle: Vehicle) -> list[set[str]]:
     return out
 
 
-def telling(trials: Sequence[Streams], vehicle: Vehicle, axes: Sequence[str]) -> list[Streams]:
+def exciting_trials(trials: Sequence[Streams], vehicle: Vehicle, axes: Sequence[str]) -> list[Streams]:
     """Return the trials that excite at least one of some axes; all of them if none does.
 
     In the other trials the vehicle moves on axes that are not fitted and possibly not measured, which affects

@@ -30,7 +30,7 @@ SHOWN = 4
 """Number of trials in the curve of an axis."""
 
 
-def believed(problem: Shooting, solution: FitSolution) -> NDArray[np.bool_]:
+def valid_samples(problem: Shooting, solution: FitSolution) -> NDArray[np.bool_]:
     """Return a mask of the samples that count in figures of quality, (N,).
 
     Excluded are samples that the fit rejects and that are isolated among the residuals of their channel and
@@ -92,7 +92,7 @@ def quality(
 
     Units are those of the channel; R² and NRMSE are dimensionless.
     """
-    out, good, names = {}, believed(problem, solution), channels(problem, solution)
+    out, good, names = {}, valid_samples(problem, solution), channels(problem, solution)
     for axis in axes:
         name = names[axis]
         rows, trial, spans = _shown_by(problem, name, good)
@@ -142,7 +142,7 @@ def held_out(
         by_trial: True to leave out complete trials.
     """
     problem, point = stage.problem, stage.solution.point
-    good, names = believed(problem, stage.solution), channels(problem, stage.solution)
+    good, names = valid_samples(problem, stage.solution), channels(problem, stage.solution)
     trial = problem.groups[problem.measured.segment]
     group = np.unique(trial if by_trial else time_blocks(problem, trial), return_inverse=True)[1]
     evidence = evidence_of(problem, stage.solution, group)
@@ -206,7 +206,7 @@ def unexplained(
 
     R² is dimensionless.
     """
-    rows, trial, _ = _shown_by(problem, channels(problem, solution)[axis], believed(problem, solution))
+    rows, trial, _ = _shown_by(problem, channels(problem, solution)[axis], valid_samples(problem, solution))
     worst, least = "", np.inf
     for g, one in enumerate(used):
         those = rows[trial == g]
@@ -233,7 +233,7 @@ def pictures(stage: Stage, axes: Sequence[str], error: Array | None = None) -> t
     band = 1.96 * np.sqrt(solution.std**2 + np.einsum("ni,ij,nj->n", slopes, variance, slopes))
     how = "simulated from the inputs alone" if error is None else "each segment predicted without it"
     error = solution.linear.residual if error is None else error
-    m, out, good = problem.measured, [], believed(problem, solution)
+    m, out, good = problem.measured, [], valid_samples(problem, solution)
     names, clock = channels(problem, solution), m.clock
     for axis in axes:
         name, parts = names[axis], []

@@ -23,7 +23,7 @@ from finssim.identification.estimates import (
     other_estimates,
     terminal_speed,
 )
-from finssim.identification.excitation import SWINGING, excited, observable, speeds, telling
+from finssim.identification.excitation import SWINGING, excited, exciting_trials, observable, speeds
 from finssim.identification.fit import Estimate, Fit
 from finssim.identification.judgement import fit_findings, held_out, pictures, quality, unexplained
 from finssim.identification.next_dive import next_dive
@@ -146,7 +146,7 @@ def axis_results(
         speed = float(np.sqrt(own[0] * own[1])) if stage.problem.coasts else own[1]
         known = is_drag_known(p, x, stage.found, axis, speed, shapes.get(axis))
         result = axis_result(p, x, numbers, axis, speeds=own, drag_known=known, given=fit.known.get(axis))
-        reason = unbelievable(fit, stage, axis, figures.get(axis, {}).get("r2", 1.0))
+        reason = rejection_reason(fit, stage, axis, figures.get(axis, {}).get("r2", 1.0))
         if reason:
             result.believe_nothing(reason)
         if axis == "heave":
@@ -160,7 +160,7 @@ def axis_results(
     return found | others, axes, bounds
 
 
-def unbelievable(fit: Stages, stage: Stage, axis: str, r2: float) -> str:
+def rejection_reason(fit: Stages, stage: Stage, axis: str, r2: float) -> str:
     """Return the reason why the fit of an axis is not credible, or an empty text.
 
     Args:
@@ -299,7 +299,7 @@ def fit_by_simulation(
     remarks = [*remarks, *more]
     say("preparing the start", 0.1)
     estimate = [*estimate, "thrust_scale"] if likely else estimate
-    telling_trials = telling(prepared, vehicle, chosen)
+    telling_trials = exciting_trials(prepared, vehicle, chosen)
     fit = Stages(telling_trials, vehicle, chosen, estimate, known or {}, horizon, say, likely, published)
     fit.require_shown()
     if isinstance(damping, str):
@@ -400,9 +400,11 @@ def _axes(
                 f"{vehicle.name}: {finding('nothing_excited').text}; name the axes, or give trials with larger inputs"
             )
         named = {axis for s in prepared for axis in s.trial.header.axis}
-        return moved, [finding("axis_untold", axis) for axis in AXES if axis in named and axis not in seen]
+        return moved, [
+            finding("axis_undetermined", axis) for axis in AXES if axis in named and axis not in seen
+        ]
     driven = any(s.drive.source != "passive" for s in prepared)
-    remarks = [finding("axis_untold", axis) for axis in axes if axis not in seen]
+    remarks = [finding("axis_undetermined", axis) for axis in axes if axis not in seen]
     unmoved = [axis for axis in axes if axis in seen and axis not in moved]
     remarks += [finding("axis_doubtful" if driven else "axis_not_free", axis) for axis in unmoved]
     chosen = tuple(a for a in AXES if a in axes and a in seen and (driven or a in moved))

@@ -587,7 +587,7 @@ NARROWEST = 0.02
 """Least variation of a determined parameter in both directions: intervals include noise, but no model errors."""
 WIDEST = (0.0, 5.0)
 """Limits of the factors."""
-UNTOLD = (0.5, 2.0)
+UNDETERMINED_RANGE = (0.5, 2.0)
 """Range of parameters that the trials could not determine, or that are guesses in the vehicle file."""
 OTHER = (0.9, 1.1)
 """Range of parameters that were not estimated, and are not guesses in the vehicle file."""
@@ -688,7 +688,7 @@ def _factor(path: str, fit: Fit, vehicle: Vehicle) -> Factor:
     if estimate is not None:
         return _of_estimate(estimate)
     if vehicle.origin_of(path).origin == "guessed":
-        return Factor(*UNTOLD, "guessed")
+        return Factor(*UNDETERMINED_RANGE, "guessed")
     return Factor(*OTHER, "not fitted")
 
 
@@ -698,7 +698,7 @@ def _of_estimate(estimate: Estimate) -> Factor:
     if not (
         estimate.identifiable and math.isfinite(low) and math.isfinite(high) and estimate.estimate != 0.0
     ):
-        return Factor(*UNTOLD, "undetermined")
+        return Factor(*UNDETERMINED_RANGE, "undetermined")
     low, high = sorted((low / estimate.estimate, high / estimate.estimate))
     low, high = min(low, 1.0 - NARROWEST), max(high, 1.0 + NARROWEST)
     return Factor(max(low, WIDEST[0]), min(high, WIDEST[1]), "determined")

@@ -37,8 +37,8 @@ from finssim.evaluation.robot_trials import (
     RobotError,
     RobotJob,
     firmware_of,
+    open_results_folder,
     played_trial,
-    take_folder,
 )
 from finssim.evaluation.tables import Table, cells, print_tables, write_page
 from finssim.identification.fit import Fit
@@ -519,7 +519,7 @@ def demo(
         "vehicle": {"name": standing.name, "sha256": standing.sha256}, "seed": settings.seed,
         "steps": settings.steps, "firmware": settings.firmware, "robot": robot is not None,
     }  # fmt: skip
-    take_folder(Path(out) / "demo.yaml", about)
+    open_results_folder(Path(out) / "demo.yaml", about)
     if must_move(standing):
         if robot is not None or settings.firmware != "mcu":
             raise RobotError(

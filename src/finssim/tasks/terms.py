@@ -11,7 +11,7 @@ from typing import Any
 
 import warp as wp
 
-from finssim.control.course import nothing_known
+from finssim.control.course import initial_memory
 from finssim.physics.types import vec6
 from finssim.sim.state import State
 from finssim.tasks.arrays import TaskArrays
@@ -111,7 +111,7 @@ def open_episode(arrays: TaskArrays, w: int):
     for i in range(arrays.action.shape[1]):
         arrays.previous_action[w, i] = 0.0
     for v in range(arrays.steering.shape[1]):
-        arrays.steering[w, v] = nothing_known()
+        arrays.steering[w, v] = initial_memory()
 
 
 @wp.func

@@ -276,7 +276,7 @@ def with_identifiability(
         verdicts = (
             _passive_identifiability(report) if passive else _driven_identifiability(report, motion, vehicle)
         )
-    return replace(report, tells={name: Identifiability(*verdicts[name]) for name in names})
+    return replace(report, identifiability={name: Identifiability(*verdicts[name]) for name in names})
 
 
 def _blocked(
@@ -625,7 +625,9 @@ def _motion_of(trial: Trial, vehicle: Vehicle, findings: list[Finding]) -> tuple
     density = (trial.header.water.density or vehicle.water.density) / vehicle.water.density
     excess = vehicle.buoyancy * density - vehicle.weight
     findings += work_findings(axes, trial_motion, trial.header.axis, excess)
-    if not any(axis.excited or any(one.can for one in axis.tells.values()) for axis in axes):
+    if not any(
+        axis.excited or any(one.identifiable for one in axis.identifiability.values()) for axis in axes
+    ):
         moved = any(axis.source for axis in axes)
         findings.append(finding("nothing_excited" if moved else "nothing_measured"))
     for named in trial.header.axis:

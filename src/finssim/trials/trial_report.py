@@ -45,8 +45,8 @@ class StreamReport:
 class Identifiability:
     """Identifiability of one parameter in a trial, with the reason."""
 
-    can: bool
-    why: str
+    identifiable: bool
+    reason: str
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,7 +74,7 @@ class AxisReport:
     rests: float = 0.0
     """Duration without input and motion [s]."""
     excited: bool = False
-    tells: dict[str, Identifiability] = field(default_factory=dict)
+    identifiability: dict[str, Identifiability] = field(default_factory=dict)
     """Identifiability by parameter."""
 
 
@@ -119,7 +119,9 @@ def identified_by(reports: Sequence[TrialReport], axis: str, parameter: str) -> 
         for report in reports
         if report.verdict != "refused" and report.role != "held-out"
         for axis_report in report.axes
-        if axis_report.axis == axis and parameter in axis_report.tells and axis_report.tells[parameter].can
+        if axis_report.axis == axis
+        and parameter in axis_report.identifiability
+        and axis_report.identifiability[parameter].identifiable
     ]
 
 
@@ -147,7 +149,7 @@ def set_findings(reports: Sequence[TrialReport]) -> list[Finding]:
         findings.append(finding("few_trials", trials=fitting))
     nothing = [a for a in AXES if not any(identified_by(reports, a, parameter) for parameter in PARAMETERS)]
     if nothing and len(nothing) < len(AXES):
-        findings.append(finding("axes_untold", axes=tuple(map(str, nothing))))
+        findings.append(finding("axes_undetermined", axes=tuple(map(str, nothing))))
     return findings
 
 
@@ -246,16 +248,18 @@ def _identifiability_table(axes: Sequence[AxisReport]) -> Table:
     grid = Table.grid(padding=(0, 1))
     for a in axes:
         by_reason: dict[tuple[bool, str], list[str]] = {}
-        for name, verdict in a.tells.items():
-            by_reason.setdefault((verdict.can, verdict.why), []).append(name)
+        for name, verdict in a.identifiability.items():
+            by_reason.setdefault((verdict.identifiable, verdict.reason), []).append(name)
         if len(by_reason) == 1 and not next(iter(by_reason))[0]:
             grid.add_row("", a.axis, f"[red]nothing[/red]: {escape(next(iter(by_reason))[1])}")
         elif by_reason:
             parts = [
                 f"[green]{', '.join(names)}[/green] ({escape(reason)})"
-                if can
+                if identifiable
                 else f"not {', '.join(names)} ({escape(reason)})"
-                for (can, reason), names in sorted(by_reason.items(), key=lambda item: not item[0][0])
+                for (identifiable, reason), names in sorted(
+                    by_reason.items(), key=lambda item: not item[0][0]
+                )
             ]
             grid.add_row("", a.axis, "; ".join(parts))
     return grid

@@ -211,7 +211,10 @@ def test_a_dive_of_sticks_alone_identifies_the_vehicle(tmp_path):
         travelled += 0.02 * TO_FOSSEN.vector(world.simulator.numpy("velocity")[0, 0, :3])
     trials = read_trials([dive.tlog(tmp_path / "dive.tlog")], vehicle="bluerov2_heavy")
     (report,) = check_trials(trials)
-    told = {axis.axis: {name for name, one in axis.tells.items() if one.can} for axis in report.axes}
+    told = {
+        axis.axis: {name for name, one in axis.identifiability.items() if one.identifiable}
+        for axis in report.axes
+    }
     assert {"m_eff", "d1", "d2"} <= told["surge"] & told["yaw"] and "d1" not in told["sway"]
     found = fit_hydrodynamics(trials, HEAVY, axes=["surge", "yaw"], known={}).estimates
     for name, true in (

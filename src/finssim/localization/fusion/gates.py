@@ -118,7 +118,7 @@ class GateMemory:
     support: int = 0
     """Number of measurements accepted since the state was started from one, up to `reacquire_samples`; 0: no state."""
     suspects: Suspects | None = None
-    believed: int = 0
+    accepted: int = 0
     """Number of accepted measurements, up to `LONGEST_SUPPORT`."""
     rival: Rival | None = None
 
@@ -128,7 +128,7 @@ class GateMemory:
         if self.rival is not None:
             return self.rival.offset**2 * self.rival.held / (self.rival.held + self.rival.won)
         if self.suspects is not None and self.suspects.hits > 1:
-            return self.suspects.value[0] ** 2 * self.suspects.hits / (self.suspects.hits + self.believed)
+            return self.suspects.value[0] ** 2 * self.suspects.hits / (self.suspects.hits + self.accepted)
         return 0.0
 
 
@@ -206,13 +206,13 @@ def judge_carried(
     verdict, after = judge(gate, memory, time, value, R, distance, drift)
     if verdict == "reacquired":
         hits = memory.suspects.hits + 1 if memory.suspects is not None else 1
-        if hits * OUTVOTED < memory.believed:
+        if hits * OUTVOTED < memory.accepted:
             suspects = remember(memory.suspects, time, value, R, drift, gate)
-            return "gate", GateMemory(memory.support, suspects, memory.believed, rival)
-        return verdict, GateMemory(after.support, None, hits, Rival(-residual, memory.believed, hits))
+            return "gate", GateMemory(memory.support, suspects, memory.accepted, rival)
+        return verdict, GateMemory(after.support, None, hits, Rival(-residual, memory.accepted, hits))
     if verdict == "gate":
-        return verdict, GateMemory(after.support, after.suspects, memory.believed, rival)
-    believed = min(memory.believed + 1, LONGEST_SUPPORT)
+        return verdict, GateMemory(after.support, after.suspects, memory.accepted, rival)
+    accepted = min(memory.accepted + 1, LONGEST_SUPPORT)
     if rival is not None:
         rival = Rival(rival.offset, rival.held, rival.won + 1) if rival.won < 2 * rival.held else None
-    return verdict, GateMemory(after.support, None, believed, rival)
+    return verdict, GateMemory(after.support, None, accepted, rival)
