@@ -18,7 +18,7 @@ FINSROV = load_vehicle("finsrov")
 
 
 def test_every_cause_begins_with_nothing_and_changes_something():
-    """At its first amount the plant is that of the file, at its last one it is not."""
+    """At its first amount the plant is that of the file, at its last one it differs."""
     task = task_named("t1")
     agent = agent_for("pid", FINSROV, task)
 
@@ -39,7 +39,8 @@ def test_every_cause_begins_with_nothing_and_changes_something():
 
 
 def test_a_table_and_a_figure_that_a_later_call_does_not_play_again(tmp_path, monkeypatch):
-    """With ballast the tuned PID holds, the published gains do not; a second call reads what the first wrote."""
+    """With ballast the tuned PID holds, the published gains do not; a second call reads the results of the
+    first."""
     monkeypatch.setitem(module.CAUSES, "ballast", replace(CAUSES["ballast"], amounts=(0.0, 16.0)))
     options = {"causes": ("ballast",), "rows": ("pid", "pid-paper"), "seeds": 1, "trials": 2, "processes": 1}
     result = anatomy(out=tmp_path, **options)
@@ -56,7 +57,7 @@ def test_a_table_and_a_figure_that_a_later_call_does_not_play_again(tmp_path, mo
 
 
 def test_what_is_tolerated_ends_where_too_few_hold_first():
-    """Whatever holds beyond it."""
+    """Amounts that hold beyond that point do not count."""
     shares = {"a": [1.0, 0.95, 0.5, 1.0], "b": [0.8, 1.0, 1.0, 1.0], "c": [1.0, 1.0, 0.9, 0.9]}
     cause = {
         "amounts": [0.0, 1.0, 2.0, 3.0],
@@ -66,7 +67,7 @@ def test_what_is_tolerated_ends_where_too_few_hold_first():
 
 
 def test_an_unknown_cause_or_row_is_refused(tmp_path):
-    """With those that there are."""
+    """The refusal lists the known ones."""
     with pytest.raises(ValueError, match="unknown cause 'wind'; available: lag, delay"):
         anatomy(out=tmp_path, causes=("wind",))
     with pytest.raises(ValueError, match="unknown row 'noise'; available: calibrated"):

@@ -17,7 +17,7 @@ def weight_in_water(body):
 
 
 def test_each_change_is_the_one_that_it_says():
-    """A kilogram of 3000 kg/m³ at its place, one thruster of eight, all of the damping; nothing else."""
+    """A kilogram of 3000 kg/m³ at its position, one thruster of eight, all of the damping; nothing else."""
     loaded = study.changed(SPEC, "payload", "")
     more = weight_in_water(loaded.body) - weight_in_water(SPEC.body)
     assert more == pytest.approx(9.81 * (1.0 - VEHICLE.water.density / 3000.0))
@@ -35,7 +35,7 @@ def test_each_change_is_the_one_that_it_says():
 
 @pytest.mark.slow
 def test_a_minute_of_driving_finds_a_weak_thruster_and_the_tables_say_so():
-    """Through the robot's software in lock-step with a pool whose camera, IMU and motors have their noise."""
+    """The robot's software runs in lock-step with a pool whose camera, IMU and motors are noisy."""
     plan = make_plan(VEHICLE, "3", "nominal", camera="corners", seed=3)
     plan = study.replace(plan, spec=study.changed(plan.spec, "thruster", "H_LB"))
     result = study.found(study.follow(plan, VEHICLE, 3), "thruster", "H_LB", VEHICLE.water.density)

@@ -1,4 +1,4 @@
-"""Studies are programs: their options are those of their functions."""
+"""Studies are programs whose options are the parameters of their functions."""
 
 import inspect
 import re
@@ -25,13 +25,13 @@ STUDIES = {
 
 
 def test_no_study_is_left_out():
-    """Every module of the package is one."""
+    """Every module of the package is a study."""
     assert {path.stem for path in (ROOT / "studies").glob("[!_]*.py")} == set(STUDIES)
 
 
 @pytest.mark.parametrize("name", STUDIES)
 def test_help_explains_every_option_and_has_an_example(capsys, name):
-    """The example has only options of the study; all print JSON, and seeds begin at 1."""
+    """The example uses only options of the study; all print JSON, and seeds begin at 1."""
     assert study(name, "--help") == 0
     text = " ".join(capsys.readouterr().out.split())
     example = re.search(rf"Example: (python -m studies\.{name} .*?)(?= Arguments:| Options:)", text)[1]
@@ -42,7 +42,7 @@ def test_help_explains_every_option_and_has_an_example(capsys, name):
 
 @pytest.mark.parametrize("name", STUDIES)
 def test_options_are_parameters_with_the_same_defaults(name):
-    """As read from the source, and as Python has them."""
+    """Defaults read from the source equal those of the Python function."""
     parameters = inspect.signature(getattr(import_module(f"studies.{name}"), STUDIES[name])).parameters
     for option in read(f"studies.{name}:{STUDIES[name]}").all_options():
         assert parameters[option.name].default == option.default
@@ -50,7 +50,7 @@ def test_options_are_parameters_with_the_same_defaults(name):
 
 @pytest.mark.slow
 def test_a_study_runs_from_the_checkout(tmp_path):
-    """In a process of its own; a refused word is one sentence and exit status 2."""
+    """It runs in its own process; an invalid word gives one sentence and exit status 2."""
     words = [sys.executable, "-m", "studies.faults", "--scenarios", "flood", "--out", str(tmp_path / "out")]
     done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 2 and done.stdout == ""

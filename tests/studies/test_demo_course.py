@@ -1,4 +1,4 @@
-"""The demonstration of a vehicle with fins, in small: it identifies, trains, dives, reports, and continues."""
+"""A short demonstration of a vehicle with fins identifies, trains, dives, reports, and continues."""
 
 import pytest
 from rich.console import Console
@@ -11,7 +11,7 @@ pytestmark = pytest.mark.slow
 
 
 def test_the_loop_closes_and_an_interrupted_one_continues(tmp_path, monkeypatch, capsys):
-    """Trials, vehicle, policy, dives and report; a second call plays nothing again and prints the same."""
+    """It makes trials, vehicle, policy, dives and report; a second call repeats nothing and prints the same."""
     monkeypatch.setattr(demo_course, "FIT", ("zigzag_fast",))
     monkeypatch.setattr(demo_course, "AXES_FITTED", ("surge", "sway", "yaw"))
     monkeypatch.setattr(demo_course, "DIVES", 1)

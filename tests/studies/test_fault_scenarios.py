@@ -1,4 +1,4 @@
-"""A hand on the wire changes what passes, and nothing else."""
+"""Fault injection on the wire changes the intended data, and nothing else."""
 
 from dataclasses import replace
 
@@ -19,20 +19,21 @@ SURGE = encode_command(ThrusterCommand(True, (-0.3, -0.3, 0.0, 0.0, 0.0, -0.3, 0
 
 @pytest.fixture
 def wire():
-    """To a pool without a camera."""
+    """A wire to a pool without a camera."""
     start_warp()
     return FaultyWire(VirtualPool(VEHICLE, draw_plant(VEHICLE, 1, "nominal")), 60.0)
 
 
 def test_an_untouched_wire_passes_every_byte(wire):
-    """As the pool alone sends them."""
+    """The bytes equal those of the pool alone."""
     alone = VirtualPool(VEHICLE, draw_plant(VEHICLE, 1, "nominal"))
     for k in range(1, 31):
         assert wire.exchange(k / 60, [SURGE]) == alone.exchange(k / 60, [SURGE])
 
 
 def test_a_shift_moves_the_robots_clock_and_not_the_pools(wire):
-    """Deliveries and arrivals by 5 s; the pool goes on by one period a turn, whatever it is asked."""
+    """Deliveries and arrivals shift by 5 s; the pool advances by one period per turn, whatever time is
+    requested."""
     first = wire.exchange(1 / 60, [])
     wire.shift = 5.0
     second = wire.exchange(99.0, [])
@@ -42,7 +43,7 @@ def test_a_shift_moves_the_robots_clock_and_not_the_pools(wire):
 
 
 def test_a_changed_snapshot_still_decodes(wire):
-    """The depth is what the hand made of it, under a right checksum; all else is as it was."""
+    """The depth is the injected one, with a valid checksum; everything else is unchanged."""
     wire.change = lambda telemetry: replace(telemetry, depth=0.25)
     decoder = Decoder(outputs=8)
     delivery = wire.exchange(0.0, [])
@@ -52,7 +53,7 @@ def test_a_changed_snapshot_still_decodes(wire):
 
 
 def test_the_course_is_the_truth_at_each_exchange(wire):
-    """Thrust appears after frames that enable it, and both are noted."""
+    """Thrust appears after frames that enable it, and both are recorded."""
     for _ in range(30):
         wire.exchange(0.0, [SURGE])
     course = wire.course()

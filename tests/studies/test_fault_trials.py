@@ -1,4 +1,4 @@
-"""Faults end to end: the robot's whole software against a pool, and a control that shows what its watchdogs are for."""
+"""Faults end to end: the robot's whole software against a pool, and a control without watchdogs."""
 
 import pytest
 
@@ -6,16 +6,16 @@ from studies import faults
 from studies.faults import AUTOPILOT, SCENARIOS, fault_job, play
 
 ELSEWHERE = {"ap-none", "ap-origin", "ap-leap", "ap-lag-leap"}
-"""Scenarios of which `tests/robot/links/test_mavlink.py` asks more, without the study."""
+"""Scenarios that `tests/robot/links/test_mavlink.py` tests more thoroughly, without the study."""
 
 
 @pytest.fixture
 def tried(tmp_path):
-    """Plays a scenario."""
+    """Function that plays a scenario."""
 
     def trial(scenario, variant="", motion="moving"):
         result = play(fault_job(scenario, variant, motion), tmp_path / "trial")
-        assert not result["raised"] and result["thrust_n"] > 0.5  # something was there to be stopped
+        assert not result["raised"] and result["thrust_n"] > 0.5  # there was thrust to stop
         assert not list(tmp_path.glob("*.mcap"))
         return result
 
@@ -24,7 +24,8 @@ def tried(tmp_path):
 
 @pytest.mark.slow
 def test_without_watchdogs_a_cut_link_drives_the_vehicle_out(tried):
-    """The control: thrust never ends, the workspace is left, and the verdict says so; with watchdogs it passes."""
+    """In this control thrust never ends, the vehicle leaves the workspace, and the trial fails; with
+    watchdogs it passes."""
     control = tried("control")
     assert not control["ok"] and control["thrust_gone_s"] is None and control["margin_m"] < 0.0
     assert control["speed_m_s"] > 0.2
@@ -35,21 +36,21 @@ def test_without_watchdogs_a_cut_link_drives_the_vehicle_out(tried):
 
 @pytest.mark.slow
 def test_a_clock_set_back_an_hour_stops_the_vehicle_and_not_the_record(tried):
-    """Past zero, where a record has no time any more."""
+    """The clock goes below zero, where a record has no valid time."""
     result = tried("robot-clock", "-3600 s")
     assert result["ok"] and "clock jumped" in result["reason"] and result["record_lost_s"] == 0.0
 
 
 @pytest.mark.slow
 def test_a_second_publisher_stops_the_vehicle(tried):
-    """At the next step."""
+    """It stops at the next step."""
     result = tried("second-publisher")
     assert result["ok"] and "two publishers" in result["reason"] and result["frames_off_s"] < 0.1
 
 
 @pytest.mark.slow
 def test_a_full_disk_ends_the_record_and_not_the_trip(tried, caplog):
-    """The vehicle drives on; what was recorded until then can be read."""
+    """The vehicle continues; everything recorded before can be read."""
     result = tried("full-disk")
     assert result["ok"] and result["state"] == "armed" and result["thrust_gone_s"] is None
     assert result["record_lost_s"] < 1.0 and "recording stopped: File too large" in caplog.text
@@ -66,9 +67,9 @@ def test_a_full_disk_ends_the_record_and_not_the_trip(tried, caplog):
     ],
 )
 def test_what_befalls_an_autopilot_ends_as_its_page_says(tmp_path, monkeypatch, row, variant):
-    """For the reason named, and in time; who steers by hand has the vehicle, who only looks disturbs nothing.
+    """The run ends in time for the stated reason; a manual pilot takes control, and an observer disturbs nothing.
 
-    Watched for 6 s at least, 4 s longer than the time in which it must end.
+    It is watched for at least 6 s, 4 s longer than the time in which it must end.
     """
     monkeypatch.setattr(faults, "WATCHED", 6.0)
     result = play(fault_job(row, variant, "moving", vehicle="bluerov2_heavy"), tmp_path / "trial")
@@ -77,14 +78,15 @@ def test_what_befalls_an_autopilot_ends_as_its_page_says(tmp_path, monkeypatch, 
 
 @pytest.mark.slow
 def test_a_vehicle_that_is_blind_for_a_while_waits_and_goes_on(tried):
-    """3 s: no thrust until it sees again, then armed; 10 s: a fault that names the camera."""
+    """After 3 s without vision it stays armed and thrust returns; after 10 s there is a fault that names the
+    camera."""
     short, long = tried("blind-3", motion="station"), tried("blind-10", motion="station")
     assert short["ok"] and short["state"] == "armed" and short["thrust_gone_s"] < 2.5
     assert long["ok"] and long["state"] == "fault" and "camera" in long["reason"]
 
 
 def test_every_fault_of_the_contract_is_in_the_catalogue():
-    """And each has something that begins it."""
+    """Each fault has a scenario that causes it."""
     wanted = {"loss-10", "loss-30", "loss-50", "reordering", "duplicates", "corrupt", "frozen-sensors"}
     wanted |= {
         "frozen-picture",

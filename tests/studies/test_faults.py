@@ -29,7 +29,7 @@ def told(*trials):
 
 @pytest.mark.slow
 def test_the_command_plays_a_scenario_and_goes_on_where_it_was(capsys, tmp_path):
-    """The control, which fails as it must: status 0, a result and a table; again, without playing."""
+    """The control fails as intended: status 0, a result and a table; a second call does not play it again."""
     words = ["--scenarios", "control", "--processes", "1", "--out", tmp_path]
     assert study("faults", *words, "--json") == 0
     result = json.loads(capsys.readouterr().out)
@@ -43,13 +43,13 @@ def test_the_command_plays_a_scenario_and_goes_on_where_it_was(capsys, tmp_path)
 
 
 def test_an_unknown_scenario_is_refused(capsys, tmp_path):
-    """With the names of those there are."""
+    """The refusal lists the known scenarios."""
     assert study("faults", "--scenarios", "flood", "--out", tmp_path) == 2
     assert "unknown scenario 'flood'; available: kill-robot" in capsys.readouterr().err
 
 
 def test_a_row_shows_the_worst_of_its_trials():
-    """Longest times, least margin, and every way in which they ended."""
+    """It has the longest times, the least margin, and every outcome."""
     rows, shown = told(
         trial("link-cut"),
         trial("link-cut", thrust_gone_s=0.9, margin_m=0.1, reason="noise"),
@@ -62,7 +62,7 @@ def test_a_row_shows_the_worst_of_its_trials():
 
 
 def test_what_failed_is_told():
-    """In its row, in the count, and in a sentence with its numbers."""
+    """A failure appears in its row, in the count, and in a sentence with its numbers."""
     rows, shown = told(trial("mcu-reboot", ok=False, thrust_gone_s=None, margin_m=-0.3), trial("mcu-reboot"))
     assert rows[0][-1] == "FAILED 1" and "passed: 1 of 2" in shown.headline
     (sentence,) = shown.sentences
@@ -70,7 +70,7 @@ def test_what_failed_is_told():
 
 
 def test_a_control_that_passes_is_wrong():
-    """The table could not tell then."""
+    """A passing control would mean that the table cannot detect failures."""
     assert row_ok("control", [trial("control", ok=False)]) and not row_ok("control", [trial("control")])
     assert not row_ok("link-cut", [trial("link-cut", ok=False)]) and not row_ok("link-cut", [])
     rows, _ = told(trial("control"))
@@ -78,7 +78,7 @@ def test_a_control_that_passes_is_wrong():
 
 
 def test_the_page_on_ardusub_has_the_figures_of_the_result():
-    """Every scenario passed in it, and the times of the page's table are the longest of its trials."""
+    """Every scenario in the result passed, and the times in the page's table are the longest of its trials."""
     result = json.loads((ROOT / "results" / "bluerov2_faults.json").read_text())
     assert result["ok"] and {t["job"]["row"] for t in result["trials"]} == set(AUTOPILOT)
     page = (ROOT / "docs" / "bluerov2.md").read_text()

@@ -13,7 +13,7 @@ from studies.soak import FLAT, memory_mib, verdict
 
 
 def test_a_leak_is_told_from_a_cache_that_fills():
-    """2 MiB an hour grows; 30 MiB in the first minutes and nothing after does not."""
+    """2 MiB an hour is growth; 30 MiB in the first minutes and nothing afterwards is not."""
     t = np.linspace(0.0, 4 * 3600.0, 200)
     noise = 0.2 * np.sin(t)
     leak, filled = (
@@ -27,7 +27,7 @@ def test_a_leak_is_told_from_a_cache_that_fills():
 
 @pytest.mark.slow
 def test_memory_is_that_of_this_process():
-    """40 MiB that are touched are seen, nearly, however much memory the process had before and gave up."""
+    """About 40 MiB of touched memory are measured, whatever the process used and released before."""
     gc.collect()
     before = memory_mib()
     with mmap.mmap(-1, 40 * 2**20) as kept:
@@ -37,7 +37,7 @@ def test_memory_is_that_of_this_process():
 
 @pytest.mark.slow
 def test_a_short_soak_keeps_its_station_and_its_samples(capsys, tmp_path):
-    """14 s of vehicle time: near the station, a row every 10 s."""
+    """In 14 s of vehicle time it stays near the station and writes a row every 10 s."""
     assert study("soak", "--hours", "0.004", "--out", tmp_path, "--json") == 0
     result = json.loads(capsys.readouterr().out)
     assert abs(result["vehicle_h"] - 0.004) < 1e-3 and result["error_max_m"] < 0.1 and not result["faults"]

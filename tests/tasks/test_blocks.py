@@ -1,4 +1,4 @@
-"""Blocks of worlds are scored as worlds are one by one."""
+"""Scoring blocks of worlds equals scoring worlds one by one."""
 
 from dataclasses import replace
 
@@ -15,7 +15,8 @@ from finssim.tasks.terms import RewardTerm, Terms
 
 @pytest.mark.slow
 def test_a_step_of_t1_is_scored_in_blocks_as_world_by_world(monkeypatch):
-    """Observations, rewards and ends of 20 random steps, over the ends of episodes; the last block is not full."""
+    """Observations, rewards and ends of 20 random steps agree across ends of episodes; the last block is not
+    full."""
     runs = []
     for many in (1, 10**9):
         monkeypatch.setattr(launch, "MANY", many)

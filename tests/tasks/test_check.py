@@ -1,4 +1,4 @@
-"""`check_task` passes every task of ours and the example, and finds the mistakes that it is there for."""
+"""`check_task` accepts all built-in tasks and the example, and finds the mistakes that it is meant to find."""
 
 import importlib.util
 import os
@@ -27,7 +27,7 @@ KeepDepth = own.KeepDepth
 
 @wp.func
 def start_moving(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
-    """The velocity of the episode before stays."""
+    """Keep the velocity of the previous episode."""
     arrays.goal_position[w] = wp.vec3(0.0, 0.0, -wp.randf(wp.rand_init(key, w), 0.3, p.deepest))
     state.position[w, 0] = wp.vec3(0.0, 0.0, -0.5)
     state.quaternion[w, 0] = wp.quat_identity()
@@ -35,7 +35,7 @@ def start_moving(state: State, arrays: TaskArrays, p: Any, key: int, w: int):
 
 @wp.func
 def remember(arrays: TaskArrays, w: int):
-    """What no start sets back."""
+    """Keep a memory that no start resets."""
     q = arrays.goal_quaternion[w]
     q[0] = q[0] + arrays.action[w, 0]
     arrays.goal_quaternion[w] = q
@@ -90,7 +90,7 @@ class Endless(KeepDepth):
 
 @dataclass(frozen=True, kw_only=True)
 class Wrong(KeepDepth):
-    """A term that takes what there is not."""
+    """A task with a term that takes an argument that does not exist."""
 
     def terms(self):
         return replace(super().terms(), inside=look_up)
@@ -110,7 +110,7 @@ def test_a_term_that_takes_what_there_is_not_is_named():
 
 @dataclass(frozen=True, kw_only=True)
 class Written(KeepDepth):
-    """A term that is code as text."""
+    """A task with a term given as text of code."""
 
     def terms(self):
         return replace(super().terms(), inside="state.position[w, 0][2] < p.tolerance")
@@ -170,6 +170,6 @@ def test_a_mistake_is_named(task, sentence):
     ("name", "page"), [("own_task", "reference/task_in_warp.md"), ("own/task/keep_depth", "own_task.md")]
 )
 def test_the_page_shows_the_example(name, page):
-    """Word for word, so that what is read is what runs."""
+    """The page contains the code word for word, so readers see the code that runs."""
     page = (EXAMPLE.parents[1] / "docs" / page).read_text(encoding="utf-8")
     assert f"```py\n{(EXAMPLE.parent / f'{name}.py').read_text(encoding='utf-8')}```" in page

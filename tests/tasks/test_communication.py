@@ -1,4 +1,5 @@
-"""Messages arrive when sound and processing say so, as often as they are not lost, and hold what was sent."""
+"""Messages arrive after sound travel and processing, are lost with the given probability, and contain what
+was sent."""
 
 import math
 
@@ -12,7 +13,7 @@ from finssim.tasks import Environment, EnvironmentSetupError
 from finssim.tasks.communication import Communication
 
 SLOW = Communication(period=0.5, processing=0.23, loss=0.0, speed_of_sound=6.0)
-"""Sound so slow that a metre more is a control step later or two."""
+"""Sound so slow that one more metre delays a message by one or two control steps."""
 
 
 def environment(talk, worlds=4, **options):
@@ -20,7 +21,7 @@ def environment(talk, worlds=4, **options):
 
 
 def wander(env, steps, seed=0):
-    """Random actions; yields after every step."""
+    """Apply random actions; yield after every step."""
     rng = np.random.default_rng(seed)
     action = rng.uniform(-1.0, 1.0, (env.worlds, env.agents, env.action_size))
     for k in range(steps):
@@ -31,7 +32,7 @@ def wander(env, steps, seed=0):
 
 
 def test_delay_is_the_way_over_the_speed_of_sound_and_processing():
-    """An independent queue in NumPy hears the same messages at the same control steps."""
+    """An independent queue in NumPy receives the same messages at the same control steps."""
     env = environment(SLOW)
     heard = np.zeros((4, 3, 3), dtype=int)
     queue, places = [], {0: env.arrays.position.numpy().copy()}
@@ -60,7 +61,7 @@ def test_delay_is_the_way_over_the_speed_of_sound_and_processing():
 @pytest.mark.slow
 @pytest.mark.parametrize("loss", [0.0, 0.3, 1.0])
 def test_as_many_are_lost_as_told(loss):
-    """512 worlds, 6 pairs, 8 messages each: binomial, four standard deviations."""
+    """512 worlds, 6 pairs, 8 messages each: binomial, to four standard deviations."""
     talk = Communication(period=0.5, processing=0.0, loss=loss, speed_of_sound=1e6)
     env = environment(talk, worlds=512)
     received, possible = 0, 0
@@ -75,7 +76,7 @@ def test_as_many_are_lost_as_told(loss):
 
 
 def test_pairs_and_worlds_lose_different_messages():
-    """Where half is lost, no two of the six pairs hear the same."""
+    """With half lost, no two of the six pairs receive the same messages."""
     talk = Communication(period=0.1, processing=0.0, loss=0.5, speed_of_sound=1e6)
     env = environment(talk, worlds=8)
     seen = np.stack([env.arrays.messages.step.numpy().copy() for _ in wander(env, 60)])
@@ -84,7 +85,8 @@ def test_pairs_and_worlds_lose_different_messages():
 
 
 def test_everybody_knows_the_start_and_then_only_what_was_heard():
-    """With all lost, a team-mate stays where it was at the start; without communication, it is where it is."""
+    """With all lost, a team-mate's track stays at the start; without communication, the track is the true
+    position."""
     still = environment(Communication(loss=1.0))
     free = environment(None)
     start = still.arrays.position.numpy().copy()

@@ -1,4 +1,4 @@
-"""Ranges that grow: with the training, with steps, with success."""
+"""Ranges of randomisation grow with the training, with steps, or with success."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ ALWAYS, NEVER = {"episode_return": -1e9}, {"episode_return": 1e9}
 
 
 def environment(worlds=200, time_limit=1.0, task=None, **parts) -> Environment:
-    """T1 with short episodes, whose mass is drawn."""
+    """Return T1 with short episodes and randomised mass."""
     ranges = Ranges.model_validate({"name": "test", "mass": MASS, **parts})
     task = task or StationKeeping(time_limit=time_limit)
     return Environment(task, worlds=worlds, randomization=Randomization(ranges), threads=1, seed=3)
 
 
 def masses(env: Environment) -> np.ndarray:
-    """Drawn factor of every world."""
+    """Return the drawn mass factor of every world."""
     return env.draws.numpy(["mass"])[:, 0, 0]
 
 
@@ -35,7 +35,7 @@ def run(env: Environment, steps: int) -> None:
 
 @pytest.mark.parametrize(("done", "width"), [(0.0, 0.2), (0.1, 0.2), (0.35, 0.6), (0.6, 1.0), (1.0, 1.0)])
 def test_ranges_widen_linearly_with_the_share_of_the_training(done, width):
-    """width = start + (1 - start) (done - from) / (to - from); what is drawn next fills just that."""
+    """width = start + (1 - start) (done - from) / (to - from); the next draws fill exactly this width."""
     env = environment(worlds=1500, curriculum={"start": 0.2, "over": [0.1, 0.6]})
     env.set_progress(done)
     assert env.schedule.width == pytest.approx(width)
@@ -46,7 +46,7 @@ def test_ranges_widen_linearly_with_the_share_of_the_training(done, width):
 
 
 def test_a_curriculum_starts_with_the_vehicle_of_the_file():
-    """Everything that is drawn is at its nominal number when nothing of the width is."""
+    """At width zero everything that is drawn has its nominal value."""
     env = environment(
         curriculum={}, thrust={"failure": {"uniform": [0.0, 0.0], "probability": 0.5}}, current=(0.1, 0.3)
     )
@@ -60,7 +60,7 @@ def test_a_curriculum_starts_with_the_vehicle_of_the_file():
 
 
 def test_ranges_widen_with_the_environments_own_steps():
-    """Counted over all worlds; nobody has to tell."""
+    """Steps are counted over all worlds, without any call from the training."""
     env = environment(worlds=10, curriculum={"by": "steps", "over": [0, 2000]})
     run(env, LOOK - 1)
     assert env.schedule.width == 0.0
@@ -75,7 +75,8 @@ def test_ranges_widen_with_the_environments_own_steps():
     [(ALWAYS, 0.0, 0.5), (NEVER, 0.9, 0.4), (NEVER, 0.2, 0.0), (ALWAYS, 0.8, 1.0)],
 )
 def test_ranges_widen_with_success_and_narrow_without(success, start, width):
-    """Five looks of 50 steps with 5 episodes of 10 steps in each of 20 worlds: five steps of 0.1, within [0, 1]."""
+    """Five evaluations of 50 steps, each with 5 episodes of 10 steps in 20 worlds, give five steps of 0.1,
+    within [0, 1]."""
     plan = {"by": "success", "start": start, "episodes": 100, "success": success}
     env = environment(worlds=20, curriculum=plan)
     run(env, 5 * LOOK)
@@ -91,7 +92,7 @@ def test_too_few_episodes_are_not_judged():
 
 
 def test_success_is_counted_from_what_the_task_holds():
-    """Worlds that held long enough when their episode ended, and no others."""
+    """Worlds count that held long enough when their episode ended, and no others."""
     env = environment(worlds=6, time_limit=0.1, curriculum={"by": "success", "success": {"held": 2.0}})
     held = np.array([0.0, 1.0, 1.8, 1.95, 2.5, 9.0], np.float32)
     env.arrays.held.assign(held)
@@ -112,7 +113,7 @@ def test_a_seed_starts_the_schedule_over_and_a_reset_does_not():
 
 
 def test_a_saved_environment_goes_on_with_its_schedule():
-    """Bit for bit, with a schedule, jitter and sensors."""
+    """It continues bit for bit, with a schedule, jitter and sensors."""
     parts = {
         "slew": (0.5, 1.5),
         "command_jitter": (0.0, 0.05),
@@ -130,7 +131,7 @@ def test_a_saved_environment_goes_on_with_its_schedule():
 
 
 def test_an_evaluation_draws_from_the_whole_ranges(tmp_path):
-    """A plant has no training that its ranges could grow with."""
+    """An evaluation has no training with which the ranges could grow."""
     path = tmp_path / "plant.yaml"
     path.write_text("ranges: {name: test, mass: [0.6, 1.8], curriculum: {}}\n", encoding="utf-8")
     env = Environment(StationKeeping(), worlds=200, **load_plant(path).environment_arguments())
@@ -149,7 +150,7 @@ def test_a_schedule_without_anything_to_widen_is_refused(ranges, sentence):
 
 
 def test_a_task_without_hold_needs_to_be_told_what_success_is():
-    """Unless nothing is judged."""
+    """This is not needed if success is not used."""
     task = StationKeeping(hold=0.0)
     with pytest.raises(EnvironmentSetupError, match="has no hold time: define success"):
         environment(task=task, curriculum={"by": "success"})

@@ -1,4 +1,4 @@
-"""The batch: seeds, independence of worlds, automatic reset, refusals, noise and worlds that break."""
+"""The batch: seeds, independence of worlds, automatic reset, refusals, noise and failing worlds."""
 
 import math
 from dataclasses import dataclass, replace
@@ -29,7 +29,7 @@ def environment(worlds=8, **options):
 
 
 def run(env, steps=25, seed=0):
-    """Observations, rewards and ends of a run with random actions; worlds share no action."""
+    """Return observations, rewards and ends of a run with random actions, different in each world."""
     actions = np.random.default_rng(seed).uniform(-1.0, 1.0, (steps, 512, env.action_size))
     out = [env.arrays.observation.numpy().copy()]
     for a in actions:
@@ -44,7 +44,7 @@ def same(first, second):
 
 @pytest.mark.parametrize("action", ["wrench6", "wrench4", "thruster8", "surfaces", "course"])
 def test_equal_seeds_are_equal_runs_and_others_are_not(action):
-    """Bitwise, through several episodes, with randomisation and noise."""
+    """Runs are bit-identical through several episodes, with randomisation and noise."""
 
     def one(seed):
         ranges = Randomization("hold_for_position")
@@ -56,14 +56,14 @@ def test_equal_seeds_are_equal_runs_and_others_are_not(action):
 
 @pytest.mark.parametrize("threads", [1, 2])
 def test_a_world_does_not_know_how_many_there_are(threads):
-    """World w of 5 and of 300 live through the same, whatever the threads."""
+    """World w of 5 and of 300 is the same, for any number of threads."""
     options = {"seed": 9, "randomization": Randomization("hold_for_position"), "noise": NOISE}
     few, many = run(environment(5, **options)), run(environment(300, threads=threads, **options))
     assert same(few, [x[:5] for x in many])
 
 
 def test_a_seed_starts_the_streams_over():
-    """reset(seed) of a used environment is a new environment of that seed."""
+    """After reset(seed) a used environment equals a new environment of this seed."""
     used = environment(noise=NOISE, randomization=Randomization("fossen_learn_to_swim"), seed=1)
     run(used, 5)
     used.reset(seed=7)
@@ -73,7 +73,8 @@ def test_a_seed_starts_the_streams_over():
 
 
 def test_the_last_observation_of_an_episode_is_kept():
-    """Where an episode ends, final_observation is what a world that is not reset shows, and the next begins."""
+    """At the end of an episode final_observation is what a world without reset shows, and the next episode
+    begins."""
     going, staying = environment(16, seed=2), environment(16, seed=2, auto_reset=False)
     for a in np.random.default_rng(1).uniform(-1.0, 1.0, (10, 16, 6)):
         step, other = going.step(a), staying.step(a)
@@ -85,7 +86,7 @@ def test_the_last_observation_of_an_episode_is_kept():
 
 
 def test_totals_of_an_episode():
-    """final_return is the sum of its rewards and final_length their number."""
+    """final_return is the sum of the episode's rewards and final_length their number."""
     env = environment(4)
     rewards = [env.step(np.zeros((4, 6))).reward.copy() for _ in range(10)]
     np.testing.assert_allclose(env.arrays.final_return.numpy(), np.sum(rewards, axis=0), rtol=1e-5)
@@ -100,7 +101,7 @@ def test_an_action_of_another_shape_is_refused(shape):
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_an_action_that_is_not_finite_is_refused_by_world(value):
-    """The sentence names the world, and no world has moved."""
+    """The sentence names the world, and no world moves."""
     env = environment()
     before = env.simulator.state.steps.numpy().copy()
     action = np.zeros((8, 6))
@@ -119,7 +120,7 @@ def test_infinities_of_both_signs_are_refused():
 
 @pytest.mark.parametrize("seed", [-1, 2**31])
 def test_a_seed_that_kernels_cannot_take_is_refused(seed):
-    """At the start and at a reset; the environment goes on as it was."""
+    """It is refused at construction and at a reset; the environment is unchanged."""
     task = StationKeeping()
     with pytest.raises(EnvironmentSetupError, match=f"seed is {seed}, expected 0 to 2147483647"):
         Environment(task, seed=seed)
@@ -136,19 +137,20 @@ def test_unknown_names_are_refused():
 
 @pytest.mark.parametrize("name", ["wrench6", "wrench4", "thruster8", "pilot6", "surfaces"])
 def test_an_action_commands_what_its_mode_says(name):
-    """The environment's kernels and the mode that runs on the robot give the same thrusts, beyond ±1 too."""
+    """The environment's kernels and the mode on the robot give the same thrusts, also beyond ±1."""
     env = environment(200, action=name, **({"vehicle": "bluerov2_heavy"} if name == "pilot6" else {}))
     mode = action_mode(name, env.simulator.vehicles[0])
     action = np.random.default_rng(4).uniform(-1.3, 1.3, (200, mode.size))
     env.step(action)
     commanded = env.simulator.command.thrust.numpy()[:, 0]
-    # Forces of up to 8 N in float32; where limits bind, a rounding of the wrench moves them a little more.
+    # Forces of up to 8 N in float32; at limits, rounding of the wrench moves them slightly more.
     np.testing.assert_allclose(commanded, mode.to_thrusters(action), atol=2e-4)
 
 
 @pytest.mark.parametrize(("name", "dive"), [("course", "depth"), ("course_pitch", "pitch")])
 def test_an_order_is_carried_out_as_by_the_autopilot_of_one_robot(name, dive):
-    """Step by step the same channels, from the same states and a memory of its own; an episode starts with none."""
+    """From the same states the channels agree step by step; the memory is per world and empty when an episode
+    starts."""
     env = environment(6, action=name, auto_reset=False)
     vehicle, state = env.nominal[0], env.simulator.state
     pilot = CoursePilot(linear_model(vehicle), vehicle.name, TASK.control_step)
@@ -178,7 +180,7 @@ def test_an_order_is_carried_out_as_by_the_autopilot_of_one_robot(name, dive):
 
 
 def test_a_scaled_wrench_is_that_part_of_the_limits():
-    """wrench_scale is part of what an action means."""
+    """wrench_scale is part of the meaning of an action."""
     scale = (0.1, 0.2, 0.3, 0.0, 0.0, 0.05)
     env = environment(50, wrench_scale=scale)
     action = np.random.default_rng(4).uniform(-1.0, 1.0, (50, 6))
@@ -188,13 +190,13 @@ def test_a_scaled_wrench_is_that_part_of_the_limits():
 
 
 def test_without_noise_the_controller_sees_the_truth_itself():
-    """No copy is made: the measured arrays are the state."""
+    """The measured arrays are the state, without a copy."""
     env = environment()
     assert env.arrays.position.ptr == env.simulator.state.position.ptr
 
 
 def test_noise_has_the_statistics_it_was_given():
-    """Zero mean, the stated deviations, no correlation between axes, steps or worlds."""
+    """The mean is zero, deviations are as given, and axes, steps and worlds are uncorrelated."""
     n = 4000
     env = environment(n, noise=NOISE, threads=1)
     state, a = env.simulator.state, env.arrays
@@ -217,7 +219,7 @@ def test_noise_has_the_statistics_it_was_given():
 
 
 def _relative(q, q_true):
-    """q times the inverse of q_true, xyzw: the turn in the world frame."""
+    """Return q times the inverse of q_true, xyzw: the rotation in the world frame."""
     v, w = -q_true[:, :3], q_true[:, 3:]
     vector = q[:, 3:] * v + w * q[:, :3] + np.cross(q[:, :3], v)
     scalar = q[:, 3] * w[:, 0] - np.sum(q[:, :3] * v, axis=1)
@@ -232,7 +234,7 @@ def test_impossible_noise_is_refused(std):
 
 @pytest.mark.parametrize("auto_reset", [True, False])
 def test_a_world_that_breaks_is_reported_and_starts_over(tmp_path, capsys, auto_reset):
-    """A NaN in one world ends its episode as a termination, leaves a file, and touches no other world."""
+    """A NaN in one world terminates its episode, leaves a file, and affects no other world."""
     broken, well = (environment(8, crash_directory=tmp_path, auto_reset=auto_reset) for _ in range(2))
     for env in (broken, well):
         for _ in range(3):
@@ -256,13 +258,13 @@ def test_a_world_that_breaks_is_reported_and_starts_over(tmp_path, capsys, auto_
 
 @wp.func
 def in_the_wall(state: State, w: int):
-    """The third world begins 0.1 m inside a wall."""
+    """Start the third world 0.1 m inside a wall."""
     place_at_rest(state, w, 0, wp.vec3(wp.where(w == 2, 2.1, 1.0), 0.0, -0.5), 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Walled(Steady):
-    """It begins where it cannot."""
+    """A task with an invalid start."""
 
     name: str = "walled"
     pool: RectangularPool | None = RectangularPool()
@@ -272,7 +274,7 @@ class Walled(Steady):
 
 
 def test_a_start_outside_the_arena_is_refused_with_its_place():
-    """Its wall would throw the vehicle out at 46 m/s; in a wider arena it may begin there."""
+    """The wall would eject the vehicle at 46 m/s; in a wider arena this start is allowed."""
     with pytest.raises(
         EnvironmentSetupError, match=r"'walled' starts .* in world 2 at \(2.1, 0, -0.5\) m, outside"
     ):
@@ -281,7 +283,7 @@ def test_a_start_outside_the_arena_is_refused_with_its_place():
 
 
 def test_of_many_worlds_that_break_three_are_written(tmp_path, capsys):
-    """The others are counted, in one sentence, however many break and however often."""
+    """The others are counted in one sentence, however many fail and however often."""
     env = Environment(StationKeeping(), worlds=8, crash_directory=tmp_path / "broken")
     for _ in range(3):
         velocity = env.simulator.state.velocity.numpy()

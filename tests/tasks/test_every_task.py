@@ -1,4 +1,4 @@
-"""Claims about every task and every vehicle of the catalogue, beside those of `check_task`: bounded, reset, drawn."""
+"""Claims about every task and every vehicle of the catalogue beyond those of `check_task`."""
 
 from dataclasses import replace
 
@@ -15,7 +15,7 @@ NUMERIC = numeric_tasks()
 
 OWN = example("own_task").KeepDepth
 NAMES = [*NUMERIC, OWN().name]
-"""Those of the package, and one from outside."""
+"""Tasks of the package, and one from outside."""
 PAIRS = [
     (name, vehicle)
     for name in NAMES
@@ -26,7 +26,7 @@ PAIRS.remove((OWN().name, "torpedo"))  # whose kernel with the walls of a pool n
 """Every task with a vehicle that is pushed every way, one that cannot pitch and one with fins, and every vehicle in
 open water: the others repeat the kernels of these, or compile theirs for one case."""
 SHORT = 1.0
-"""Length of an episode [s]: several end in a test."""
+"""Length of an episode [s], so that several end in a test."""
 
 
 def environment(name, vehicle="finsrov", worlds=4, **options):
@@ -41,14 +41,14 @@ def environment(name, vehicle="finsrov", worlds=4, **options):
 
 
 def actions(env, steps, seed=0):
-    """Actions of the first worlds do not depend on how many there are."""
+    """Return actions; those of the first worlds do not depend on the number of worlds."""
     agents = () if env.agents == 1 else (env.agents,)
     shape = (env.worlds, steps, *agents, env.action_size)
     return np.random.default_rng(seed).uniform(-1.5, 1.5, shape).astype(np.float32).swapaxes(0, 1)
 
 
 def played(env, steps=25, given=None):
-    """Observations, rewards and ends of every step, as copies."""
+    """Return copies of observations, rewards and ends of every step."""
     out = []
     for action in actions(env, steps) if given is None else given:
         step = env.step(action)
@@ -61,7 +61,7 @@ def played(env, steps=25, given=None):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_the_number_of_worlds_changes_nothing(name):
-    """The first worlds of many, on two threads, are those of few, bit for bit."""
+    """The first of many worlds, on two threads, equal those of few, bit for bit."""
     few, many = environment(name, worlds=3, seed=5), environment(name, worlds=130, threads=2, seed=5)
     given = actions(many, 25)
     for a, b in zip(played(few, given=given[:, :3]), played(many, given=given), strict=True):
@@ -71,10 +71,9 @@ def test_the_number_of_worlds_changes_nothing(name):
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "vehicle"), PAIRS)
 def test_observations_stay_bounded_whatever_the_vehicle(name, vehicle):
-    """Full thrusts this way and that: numbers finite and of order one, rewards finite, episodes end, success 0 or 1.
+    """At full random thrust numbers are finite and of order one, rewards finite, episodes end, success is 0 or 1.
 
-    A task may refuse a vehicle that cannot push every way, or that its autopilot cannot steer, with a sentence that
-    says so.
+    A task may refuse, in a sentence, a vehicle that cannot push along every axis, or that its autopilot cannot steer.
     """
     try:
         env = environment(name, vehicle)
@@ -97,7 +96,7 @@ def test_observations_stay_bounded_whatever_the_vehicle(name, vehicle):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_reset_starts_over_and_leaves_the_others_alone(name):
-    """With a seed, everything as it was, with another one not; with a mask, only the masked worlds."""
+    """The same seed repeats everything, another does not; with a mask, only the masked worlds are reset."""
     env = environment(name, seed=1)
     first = env.reset(seed=1).copy()
     played(env, 5)

@@ -1,4 +1,4 @@
-"""What a task is for a vehicle that is longer than the paper's."""
+"""Tasks adapted to a vehicle that is longer than the paper's."""
 
 import io
 
@@ -24,12 +24,12 @@ NUMERIC = numeric_tasks()
 QUIET = Console(file=io.StringIO())
 
 SIZE = 2.6 / 0.6
-"""RexROV's length over that of the published pool's vehicles."""
+"""RexROV's length divided by that of the published pool's vehicles."""
 
 
 @pytest.mark.parametrize("name", ["t1", "t2"])
 def test_lengths_of_t1_and_t2_grow_with_the_vehicle_and_their_tolerance_stays(name):
-    """FinsROV has the paper's pool; starts of RexROV's episodes fill one that is 4.3 times as large, under water."""
+    """FinsROV has the paper's pool; RexROV's starts fill a pool 4.3 times as large, under water."""
     small, large = make(name, worlds=200), make(name, worlds=200, vehicle="rexrov")
     assert small.simulator.surroundings[1] == RectangularPool()
     assert large.simulator.surroundings[1].depth == pytest.approx(SIZE)
@@ -41,7 +41,7 @@ def test_lengths_of_t1_and_t2_grow_with_the_vehicle_and_their_tolerance_stays(na
 
 
 def test_setpoints_grow_with_the_pool():
-    """Places do, headings do not."""
+    """Positions grow, headings do not."""
     goal = in_room(T1_SETPOINTS["P02"], load_vehicle("rexrov"))
     np.testing.assert_allclose(goal[:3], SIZE * T1_SETPOINTS["P02"][:3])
     assert goal[3] == T1_SETPOINTS["P02"][3]
@@ -51,9 +51,9 @@ def test_setpoints_grow_with_the_pool():
 @pytest.mark.parametrize("task", [name for name in sorted(NUMERIC) if TASKS[name].needs])
 @pytest.mark.parametrize("name", catalogue())
 def test_a_vehicle_has_the_axes_of_its_task_or_is_refused_by_name(task, name):
-    """Whoever lacks an axis is told which before a world is made; whoever has all may go on.
+    """Missing axes are named before a world is made; a vehicle that has all is accepted.
 
-    Tasks by course name no axes: their autopilot refuses whom it cannot steer (test_every_task.py).
+    Tasks by course name no axes: their autopilot refuses vehicles that it cannot steer (test_every_task.py).
     """
     vehicle, needs = load_vehicle(name), TASKS[task].needs
     missing = [axis for axis in needs if axis not in vehicle.controlled_axes]
@@ -65,13 +65,13 @@ def test_a_vehicle_has_the_axes_of_its_task_or_is_refused_by_name(task, name):
     else:
         assert vehicles_of_task(name, TASKS[task](), TASKS[task].action)[0].name == name
     unable = {"eca_a9", "lauv", "remus100", "slocum", "torpedo"}
-    if "pitch" in needs:  # which six thrusters leave to the water
+    if "pitch" in needs:  # an axis that six thrusters do not control
         unable |= {"bluerov2", "bluerov2_centralenantes", "bluerov2_einarsson"}
     assert bool(missing) == (name in unable)
 
 
 def test_an_agent_may_use_all_of_finsrov_and_a_part_of_a_stronger_vehicle():
-    """Wrench over inertia, added mass included, is then at most 1 m/s² and 20 rad/s², times RexROV's size."""
+    """Wrench over inertia with added mass is at most 1 m/s² and 20 rad/s², times RexROV's size."""
     assert np.array_equal(authority(load_vehicle("finsrov")), np.ones(6))
     for name in ("bluerov2_heavy", "rexrov"):
         vehicle = load_vehicle(name)
@@ -82,7 +82,7 @@ def test_an_agent_may_use_all_of_finsrov_and_a_part_of_a_stronger_vehicle():
 
 
 def test_a_policy_says_what_its_actions_stand_for(tmp_path):
-    """The share of the limits is in its description, and so is what a robot makes of its actions."""
+    """Its description contains the share of the limits, and so does the robot's use of its actions."""
     path = train(
         "t1",
         TrainingSettings(vehicle="bluerov2_heavy", worlds=16, steps=512),
@@ -96,7 +96,7 @@ def test_a_policy_says_what_its_actions_stand_for(tmp_path):
 
 
 def test_an_underactuated_vehicle_trains_nothing(tmp_path):
-    """No policy, no folder."""
+    """There is no policy and no folder."""
     with pytest.raises(EnvironmentSetupError, match="does not control sway, heave, yaw"):
         train("t1", TrainingSettings(vehicle="remus100", steps=512), out=tmp_path / "p", console=QUIET)
     assert not any(tmp_path.iterdir())

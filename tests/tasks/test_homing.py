@@ -1,4 +1,4 @@
-"""The task into a dock by its bearing: what is drawn, what is seen, what counts, and the baseline in a current."""
+"""Docking by bearing: draws, observations, scoring, and the baseline in a current."""
 
 import math
 
@@ -18,7 +18,7 @@ VEHICLE = tailed("cruciform")
 
 
 def placed(env, position, q, velocity):
-    """Observation and metrics after a step from a state of the only world."""
+    """Return observation and metrics after a step from a state of the only world."""
     env.simulator.state.position.assign(np.asarray(position, np.float32)[None, None])
     env.simulator.state.quaternion.assign(np.asarray(q, np.float32)[None, None])
     env.simulator.state.velocity.assign(np.asarray([velocity], np.float32)[None])
@@ -26,7 +26,7 @@ def placed(env, position, q, velocity):
 
 
 def axis_of(env):
-    """Mouth and axis of every world's dock."""
+    """Return mouth and axis of every world's dock."""
     points = env.arrays.path.points.numpy().astype(float)
     way = points[:, 1] - points[:, 0]
     return points[:, 1], way / np.linalg.norm(way, axis=1, keepdims=True)
@@ -85,7 +85,7 @@ def test_a_robot_that_is_sent_to_a_station_sees_its_yaw_as_the_axis():
 
 @pytest.mark.slow
 def test_the_baseline_docks_in_a_current():
-    """Nearly all of 64 in 0.4 m/s, a quarter of their speed."""
+    """Nearly all of 64 dock in 0.4 m/s, a quarter of their speed."""
     n, task = 64, Homing()
     env = make(task, worlds=n, vehicle=VEHICLE, seed=1, water=Water(current=(0.4, 0.0, 0.0), depth=60.0))
     player = baseline(task, "bearing", VEHICLE)

@@ -1,4 +1,4 @@
-"""What the controller sees: gaps, offsets and delays, given or drawn for every episode."""
+"""Measurements of the controller: gaps, offsets and delays, fixed or drawn for every episode."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def environment(noise=None, worlds=WORLDS, **sensors) -> Environment:
 
 
 def run(env: Environment, steps: int) -> tuple[np.ndarray, np.ndarray]:
-    """Measured and true positions after each step, (steps + 1, worlds, 3)."""
+    """Return measured and true positions after each step, (steps + 1, worlds, 3)."""
     action = np.full((env.worlds, 6), 0.4, np.float32)
     seen, true = (
         [env.arrays.position.numpy()[:, 0].copy()],
@@ -49,7 +49,7 @@ def test_a_reset_elsewhere_does_not_change_what_is_seen():
 
 
 def test_offsets_of_velocities_last_an_episode():
-    """Their deviations are those that were asked for, and they do not change from step to step."""
+    """Their deviations are as given, and they do not change from step to step."""
     env = environment(MeasurementNoise(velocity_bias=0.05, rate_bias=0.02))
     offsets = []
     for _ in range(3):
@@ -60,7 +60,7 @@ def test_offsets_of_velocities_last_an_episode():
 
 
 def test_a_drawn_deviation_is_that_of_its_world():
-    """Noise over the drawn deviation is normal with deviation 1."""
+    """Noise divided by the drawn deviation is normal with deviation 1."""
     env = environment(position_std=[0.005, 0.05])
     seen, true = run(env, 12)
     std = env.draws.numpy(["sensors.position_std"])[:, 0, 0]
@@ -69,7 +69,7 @@ def test_a_drawn_deviation_is_that_of_its_world():
 
 
 def test_a_drawn_delay_is_that_of_its_world():
-    """To the nearest control step; nothing is older than the episode."""
+    """It is rounded to the nearest control step; nothing is older than the episode."""
     env = environment(delay=[0.0, 0.44])
     seen, true = run(env, 10)
     steps = np.rint(env.draws.numpy(["sensors.delay"])[:, 0, 0].astype(float) / 0.1).astype(int)
@@ -88,7 +88,7 @@ def test_a_drawn_gap_is_that_of_its_world():
 
 
 def test_what_is_not_drawn_keeps_the_given_noise():
-    """An offset of the environment's own stays beside a drawn deviation."""
+    """An offset given to the environment remains beside a drawn deviation."""
     env = environment(MeasurementNoise(position_bias=0.1), position_std=[0.0, 0.0])
     seen, true = run(env, 3)
     np.testing.assert_allclose(seen - true, (seen - true)[:1].repeat(4, axis=0), atol=1e-6)
@@ -101,7 +101,7 @@ def test_a_gap_at_every_step_is_refused():
 
 
 def test_graded_noise_grows_from_none_in_the_first_world_to_all_in_the_last():
-    """The spread over many steps is in proportion to the world's number."""
+    """The spread over many steps is proportional to the world's number."""
     env = environment(MeasurementNoise(position_std=0.1, delay=0.3, graded=True))
     rows = []
     for _ in range(200):

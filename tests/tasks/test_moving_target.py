@@ -1,4 +1,4 @@
-"""T3: how the target moves, and what of it is seen, rewarded and counted; against NumPy and SciPy."""
+"""T3: motion of the target, observation, reward and scoring, against NumPy and SciPy."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ LEVEL = (0.0, 0.0, 0.0, 1.0)
 
 
 def truth(env):
-    """Offset to the target, rotation, twist, and target velocity in the body, by world."""
+    """Return offset to the target, rotation, twist, and target velocity in the body, by world."""
     state, a = env.simulator.state, env.arrays
     R = Rotation.from_quat(state.quaternion.numpy()[:, 0])
     offset = R.inv().apply(a.goal_position.numpy() - state.position.numpy()[:, 0])
@@ -24,7 +24,7 @@ def truth(env):
 
 
 def played(env, steps, seed=0):
-    """The last step of random actions, and the positions and velocities of the targets by step."""
+    """Return the last step of random actions, and the positions and velocities of the targets by step."""
     rng, path, pace = np.random.default_rng(seed), [], []
     for _ in range(steps):
         step = env.step(rng.uniform(-1.0, 1.0, (env.worlds, 6)))
@@ -45,7 +45,7 @@ def test_the_observation_is_the_published_one():
 
 
 def test_the_target_moves_within_its_limits():
-    """Speed, acceleration and box as published; it moves on from where it was, and does not stop for good."""
+    """Speed, acceleration and box are as published; the motion is continuous and never stops for good."""
     env = Environment(replace(TASK, time_limit=60.0), worlds=256)
     start = env.arrays.goal_position.numpy().copy()
     _, path, velocity = played(env, 300)
@@ -57,14 +57,14 @@ def test_the_target_moves_within_its_limits():
     np.testing.assert_allclose(
         np.diff(np.concatenate([start[None], path]), axis=0), 0.1 * velocity, atol=1e-6
     )
-    # It needs v²/2a to stop, and one step to notice; where courses change meanwhile, some more.
+    # Stopping takes v²/2a plus one step of delay, and more if the course changes meanwhile.
     slack = 2.0 * TASK.fastest**2 / (2.0 * TASK.acceleration) + 0.1 * TASK.fastest
     assert np.all(path >= np.array(TASK.low) - slack) and np.all(path <= np.array(TASK.high) + slack)
     assert np.linalg.norm(path[-1] - path[0], axis=1).mean() > 0.1
 
 
 def test_courses_last_as_long_as_published():
-    """The wanted velocity changes every 1.5 to 4 s, at different times in different worlds."""
+    """The desired velocity changes every 1.5 to 4 s, at different times in different worlds."""
     env = Environment(
         replace(TASK, low=(-9.0,) * 3, high=(9.0,) * 3, bounds=(99.0, 99.0)), worlds=64, pool=LARGE
     )
@@ -98,7 +98,7 @@ def test_the_reward_is_the_sum_of_its_terms():
 
 
 def test_beside_a_resting_target_at_rest_there_is_most_to_earn():
-    """near + match; nothing beats it."""
+    """The reward is near + match; nothing exceeds it."""
     env = Environment(replace(TASK, fastest=0.0), worlds=1)
     env.start((0.0, 0.0, -0.5), LEVEL, (0.0, 0.0, -0.5), LEVEL)
     reward = env.step(np.zeros((1, 6))).reward[0]
@@ -121,7 +121,7 @@ def test_success_is_ten_steps_in_tolerance(off, success):
 
 
 def test_success_is_counted_once_and_stays():
-    """Who leaves the target after its success has succeeded, at the time when it was first reached."""
+    """Leaving the target afterwards does not revoke success; its time is when it was first reached."""
     env = Environment(replace(TASK, fastest=0.0, time_limit=3.0), worlds=1)
     env.start((0.0, 0.0, -0.5), LEVEL, (0.0, 0.0, -0.5), LEVEL)
     for k in range(30):
@@ -145,7 +145,7 @@ def test_leaving_the_pool_terminates_with_a_loss(position, left):
 
 
 def test_a_longer_vehicle_has_a_larger_pool_and_a_faster_target():
-    """Everything grows with the vehicle; FinsROV's is the paper's pool."""
+    """All lengths grow with the vehicle; FinsROV has the paper's pool."""
     small, large = make("t3"), make("t3", vehicle="rexrov")
     assert small.simulator.surroundings[1] == RectangularPool(stiffness=4000.0)
     size, pace = large.task.fit.size, large.task.fit.pace

@@ -1,4 +1,4 @@
-"""A policy on the robot sees what it saw in training, bit for bit, whatever the task."""
+"""A policy on the robot receives the same observation as in training, bit for bit, for every task."""
 
 from pathlib import Path
 
@@ -21,7 +21,7 @@ OWN = [f"{EXAMPLES / 'own_task.py'}:KeepDepth", f"{EXAMPLES / 'own/task/keep_dep
 
 
 class Moment:
-    """A guide that is somewhere at one time."""
+    """A guide with one position at one time."""
 
     name, duration = "moment", np.inf
 
@@ -38,7 +38,8 @@ def track(env, w, v):
 
 
 def world(env, w, yaw):
-    """What a robot would be given in place of a world of the batch: its guide, and tracks of the others by name."""
+    """Return a robot's inputs that correspond to a world of the batch: its guide, and tracks of the others by
+    name."""
     a = env.arrays
     velocity = np.zeros(3) if a.target.velocity is None else a.target.velocity.numpy()[w]
     guide = Moment(a.goal_position.numpy()[w].astype(float), velocity.astype(float), yaw[w])
@@ -61,7 +62,7 @@ def with_tracks(reading, tracks):
 
 @pytest.mark.parametrize("name", [*numeric_tasks(), *OWN])
 def test_the_robot_sees_what_the_batch_sees_bit_for_bit(name):
-    """Random actions, measurement noise, every agent; goals are exact poses on both sides."""
+    """Tested with random actions, measurement noise and every agent; goals are exact poses on both sides."""
     task = task_named(name, time_limit=200.0) if name == "t2" else task_named(name)
     env = Environment(task, worlds=4, seed=3, noise=task.training_noise)
     if name == "t2":
@@ -139,7 +140,7 @@ TORCH = (EXAMPLES / "own/task/keep_depth.py").read_text().split("if __name__")[0
 
 
 def in_torch(folder, heave, more=""):
-    """A task in torch whose second part of the observation is something else."""
+    """Return a task in torch with a different second part of the observation."""
     text = TORCH.replace("w.velocity[:, 2]\n", f"{heave}\n")
     text = text.replace("class KeepDepth(TorchTask):", f"class KeepDepth(TorchTask):\n    {more}\n")
     assert heave in text
@@ -149,7 +150,7 @@ def in_torch(folder, heave, more=""):
 
 @pytest.mark.parametrize("heave", ["w.memory['last'][:, 0]", "w.held"])
 def test_what_no_robot_knows_is_refused_before_it_runs(tmp_path, heave):
-    """A memory that reward writes, and how long the tolerance was kept; in a simulation both are there."""
+    """A memory that the reward writes, and the time within tolerance, exist only in simulation."""
     name = in_torch(tmp_path, heave, "memory = {'last': 1}")
     assert np.isfinite(Environment(task_named(name), FINSROV, worlds=2, seed=1).reset()).all()
     with pytest.raises(ControlError, match="'keep-depth' cannot be observed on a robot: it reads w") as error:
@@ -163,7 +164,7 @@ def test_a_memory_that_is_not_observed_is_no_hindrance(tmp_path):
 
 @pytest.mark.parametrize("action", ["w.action[:, 0]", "w.previous_action[:, 0]"])
 def test_a_task_in_torch_sees_its_last_actions_on_a_robot(tmp_path, action):
-    """The one that was just done, and the one before, as in the batch; none where it begins again."""
+    """The last action and the one before agree with the batch; there are none after a restart."""
     name = in_torch(tmp_path, action)
     env, observer = Environment(task_named(name), FINSROV, worlds=1, seed=1), Observer(name, FINSROV)
     me, goal = Track(np.zeros(3), quat_from_yaw(0.0), np.zeros(6)), Station((0.0, 0.0, -0.5), 0.0)
@@ -179,7 +180,7 @@ def test_a_task_in_torch_sees_its_last_actions_on_a_robot(tmp_path, action):
 
 
 def test_a_goal_out_of_reach_is_seen_on_the_way_to_it():
-    """Three metres ahead and at the reach look alike; a goal within reach is seen where it is."""
+    """A goal three metres ahead looks like one at the reach; a goal within reach is shown at its position."""
     me, observer = Track(np.array([0.1, 0.0, -0.5]), quat_from_yaw(0.0), np.zeros(6)), Observer("t1", FINSROV)
     far, edge, near = (
         observer.observe(me, Station((0.1 + ahead, 0.0, -0.5), 0.0), 0.0, reach=1.2)
@@ -190,7 +191,7 @@ def test_a_goal_out_of_reach_is_seen_on_the_way_to_it():
 
 
 def test_a_heading_out_of_reach_is_seen_on_the_way_to_it():
-    """Half a turn and the most that is shown at once look alike, on the shorter way round."""
+    """A half turn looks like the largest shown turn, along the shorter direction."""
     me, observer = Track(np.array([0.1, 0.0, -0.5]), quat_from_yaw(3.0), np.zeros(6)), Observer("t1", FINSROV)
     half, edge, near = (
         observer.observe(me, Station((0.1, 0.0, -0.5), yaw), 0.0, turn=1.0) for yaw in (-0.3, 4.0, 3.9)

@@ -1,4 +1,4 @@
-"""A task of one's own by file and class: found, made once, refused in a sentence."""
+"""A user's task by file and class is found, loaded once, or refused in a sentence."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "own/task/keep_dept
 
 
 def test_a_class_of_a_file_or_module_is_a_task():
-    """With settings of its own; a file is read once, so that two tasks of it are of one class."""
+    """It has its own settings; a file is read once, so that two tasks from it share their class."""
     task = task_named(f"{EXAMPLE}:KeepDepth", deepest=0.6)
     assert task.name == "keep-depth" and task.deepest == 0.6
     assert type(task) is type(task_named(f"{EXAMPLE}:KeepDepth"))
@@ -39,7 +39,7 @@ def test_a_class_of_a_file_or_module_is_a_task():
     ],
 )
 def test_what_is_no_task_is_refused(tmp_path, monkeypatch, text, words, sentence):
-    """Where, what, and what was expected."""
+    """The refusal gives location, problem and what was expected."""
     monkeypatch.chdir(tmp_path)
     if text is not None:
         (tmp_path / "task.py").write_text(text)

@@ -1,4 +1,4 @@
-"""Tasks along a path in space: what is drawn, what is seen, and the baseline in a current."""
+"""Tasks along a path in space: draws, observations, and the baseline in a current."""
 
 import math
 
@@ -23,7 +23,7 @@ def paths_of(env):
 
 
 def test_drawn_paths_keep_their_bounds():
-    """Legs of one length, bends no narrower than the radius, slopes no steeper than the limit, under water."""
+    """Legs have equal length, bends at least the radius, slopes at most the limit, all under water."""
     env = make("path", worlds=200, vehicle=VEHICLE, seed=2)
     task, x = env.task, paths_of(env)
     way = np.diff(x, axis=1)
@@ -53,7 +53,7 @@ def test_the_cruise_is_what_action_zero_asks_for():
 
 
 def test_the_errors_that_are_seen_are_those_of_the_path():
-    """Distances and directions of the kernels against `Waypoints`, for tilted vehicles."""
+    """Distances and directions of the kernels equal those of `Waypoints`, for tilted vehicles."""
     path = Waypoints([[0, 0, -10], [20, 5, -12], [25, 30, -8], [60, 30, -8], [60, 60, -9]], radius=2.0)
     env = make("waypoints", worlds=3, vehicle=VEHICLE, seed=3, auto_reset=False)
     follow_path(env, [path] * 3)
@@ -85,7 +85,7 @@ def test_paths_that_do_not_fit_are_refused(kind):
 
 
 def played(task, vehicle, n=64, current=0.4):
-    """Success, error and whether the end was reached of the first episode of n worlds, by the baseline."""
+    """Return success, error and arrival at the end in the first episode of n worlds, by the baseline."""
     env = make(task, worlds=n, vehicle=vehicle, seed=1, water=Water(current=(current, 0.0, 0.0), depth=60.0))
     player = baseline(task, "line-of-sight", vehicle)
     memory, observation = player.reset(n), env.reset()

@@ -1,4 +1,4 @@
-"""Privileged numbers say what was drawn, from nominal, on a scale of one."""
+"""Privileged observations are the drawn deviations from nominal, scaled to about one."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def environment(worlds=50, **more) -> Environment:
 
 
 def test_names_are_those_of_what_varies():
-    """Current by its components; directions are left out."""
+    """Current is given by its components; directions are omitted."""
     each = [f"thrust.each.{k}" for k in range(8)]
     expected = ["mass", "center_of_gravity.z", *each, "sensors.delay", "current.x", "current.y"]
     env = environment()
@@ -55,7 +55,7 @@ def test_each_is_the_difference_from_nominal_over_the_farthest_end():
 
 @pytest.mark.parametrize("name", [n for n in available() if n != "no_thruster_dynamics"])
 def test_they_are_of_about_unit_scale_for_every_set(name):
-    """Within [-1, 1], and reaching far."""
+    """They lie within [-1, 1] and use most of it."""
     env = make("t1", worlds=1000, randomize=name, privileged=True)
     x = env.arrays.privileged.numpy()
     assert abs(x).max() <= 1.0 + 1e-5
@@ -63,7 +63,7 @@ def test_they_are_of_about_unit_scale_for_every_set(name):
 
 
 def test_those_of_the_episode_that_ended_are_kept():
-    """For the value of its last observation."""
+    """They are needed for the value of the episode's last observation."""
     env = environment()
     before = env.arrays.privileged.numpy().copy()
     for _ in range(5):
@@ -83,7 +83,7 @@ def test_without_randomisation_there_are_none():
 
 
 def test_they_change_nothing_of_the_run():
-    """An observer alone."""
+    """They only observe."""
     ranges = Ranges.model_validate({"name": "test", **PARTS})
     plain = Environment(StationKeeping(time_limit=0.5), worlds=50, randomization=Randomization(ranges))
     told = environment()

@@ -1,4 +1,4 @@
-"""What is drawn for every episode lies in its range, fills it, and leaves a vehicle that could exist."""
+"""Every drawn value lies in its range, the range is filled, and the vehicle is physical."""
 
 import numpy as np
 import pytest
@@ -39,19 +39,19 @@ RANGES = Ranges(
 
 @pytest.fixture(scope="module")
 def pair():
-    """Many randomised worlds, and one as the file has it."""
+    """Many randomised worlds, and one nominal world."""
     task = StationKeeping()
     return Environment(task, worlds=WORLDS, randomization=Randomization(RANGES), seed=5), Environment(task)
 
 
 def ratio(pair, name):
-    """A field over its nominal value, one row per world."""
+    """Return a field divided by its nominal value, one row per world."""
     drawn, nominal = (getattr(env.simulator.plant, name).numpy()[:, 0] for env in pair)
     return drawn / nominal
 
 
 def fills(sample, low, high):
-    """Every sample within [low, high], and the range used to within 2 % of its width."""
+    """Assert that samples lie within [low, high] and use the range to within 2 % of its width."""
     slack = 1e-5 * max(abs(low), abs(high))
     width = high - low
     assert sample.min() >= low - slack and sample.max() <= high + slack
@@ -86,7 +86,7 @@ def test_centres_move_in_every_axis_within_their_ranges(pair):
 
 
 def test_inertia_about_the_centre_of_gravity_scales(pair):
-    """Steiner's part follows the drawn mass and centre; what is left scales by one factor."""
+    """Steiner's part follows the drawn mass and centre; the rest scales by one factor."""
     plant = pair[0].simulator.plant
     r, m = plant.r_g.numpy()[:, 0].astype(float), plant.mass.numpy()[:, 0].astype(float)
     steiner = np.einsum(
@@ -130,7 +130,8 @@ def test_added_mass_scales_where_its_coefficients_hold(pair):
 
 @pytest.mark.parametrize("ranges", [RANGES, *available()])
 def test_every_drawn_vehicle_could_exist(ranges):
-    """Added mass symmetric and positive semidefinite, total mass matrix positive definite, damping dissipative."""
+    """Added mass is symmetric positive semidefinite, total mass matrix positive definite, damping
+    dissipative."""
     env = Environment(StationKeeping(), worlds=500, randomization=Randomization(ranges), seed=11)
     plant = env.simulator.plant
     M_A, M_inv = (getattr(plant, name).numpy()[:, 0].astype(float) for name in ("M_A", "M_inv"))
@@ -155,7 +156,8 @@ def test_the_mass_matrix_that_is_used_is_the_drawn_one(pair):
 
 
 def test_the_water_is_drawn_too(pair):
-    """Currents within their speeds from every direction; waves within their sizes, on the dispersion relation."""
+    """Currents are within their speeds from every direction; waves within their sizes, on the dispersion
+    relation."""
     water = pair[0].simulator.water
     current = water.current.numpy().astype(float)
     fills(np.linalg.norm(current, axis=1), *RANGES.current)
@@ -174,7 +176,7 @@ def test_the_water_is_drawn_too(pair):
 
 
 def test_volume_with_mass_keeps_the_trim():
-    """In the published ranges that say so, volume and mass scale together."""
+    """With this option of the published ranges, volume and mass scale together."""
     env = Environment(StationKeeping(), worlds=300, randomization=Randomization("fossen_learn_to_swim"))
     vehicle = env.simulator.vehicles[0]
     mass = env.simulator.plant.mass.numpy()[:, 0] / vehicle.body.mass
@@ -184,7 +186,7 @@ def test_volume_with_mass_keeps_the_trim():
 
 
 def test_buoyancy_is_drawn_on_top_of_a_volume_with_mass():
-    """What is displaced over what it weighs fills the range, whatever the mass."""
+    """The ratio of displaced mass to mass fills its range for every mass."""
     ranges = Ranges(name="trim", mass=(0.8, 1.2), volume="with_mass", buoyancy=(0.96, 1.04))
     env = Environment(StationKeeping(), worlds=300, randomization=Randomization(ranges))
     body = env.simulator.vehicles[0].body
@@ -195,7 +197,7 @@ def test_buoyancy_is_drawn_on_top_of_a_volume_with_mass():
 
 
 def test_every_episode_has_another_vehicle():
-    """A reset draws anew in the worlds it is for, and nowhere else."""
+    """A reset draws again in the selected worlds, and in no other."""
     env = Environment(StationKeeping(), worlds=10, randomization=Randomization(RANGES))
     before = env.simulator.plant.mass.numpy().copy()
     env.reset(mask=np.arange(10) < 4)
@@ -243,7 +245,7 @@ def test_the_published_sets_ship():
 
 
 def test_without_thruster_dynamics_thrust_follows_in_one_physics_step():
-    """The ranges of the paper's ablation take lag and delay away; nominally a step does not suffice."""
+    """The ranges of the paper's ablation remove lag and delay; with the nominal ones a step does not suffice."""
 
     def reached(ranges):
         environment = Environment(
@@ -258,7 +260,7 @@ def test_without_thruster_dynamics_thrust_follows_in_one_physics_step():
 
 
 def test_the_ranges_of_a_pool_draw_currents_and_unlike_propellers():
-    """Every world has its own, within the bounds of the file."""
+    """Every world has its own values, within the bounds of the file."""
     environment = Environment(StationKeeping(), worlds=64, randomization=Randomization("pool"), seed=3)
     gain = environment.simulator.plant.gain.numpy()[:, 0]
     current = np.linalg.norm(environment.simulator.water.current.numpy(), axis=1)

@@ -1,4 +1,4 @@
-"""A run that goes on from a saved state is bitwise the run that was not interrupted."""
+"""A run continued from a saved state is bit-identical to the uninterrupted run."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ WATER = Water(current=(0.05, 0.0, 0.0), drift_std=(0.05, 0.05, 0.02), drift_time
 
 
 def made(task, **options):
-    """A few worlds in which everything is random, at episodes of random age, so that some end soon."""
+    """Return a few worlds with all randomisation, at random episode ages, so that some end soon."""
     usual = {"worlds": 6, "seed": 4, "observe": NOISE, "water": WATER, "randomize": "fossen_learn_to_swim"}
     environment = finssim.make(task, **{**usual, **options})
     limit = round(environment.task.time_limit / environment.task.control_step)
@@ -31,7 +31,7 @@ def made(task, **options):
 
 
 def act(environment, steps, seed):
-    """Everything that comes out of random actions."""
+    """Return all outputs for random actions."""
     rng, seen = np.random.default_rng(seed), []
     for _ in range(steps):
         action = rng.uniform(-1.0, 1.0, environment.arrays.action.shape).astype(np.float32)
@@ -48,11 +48,11 @@ def act(environment, steps, seed):
 @pytest.mark.slow
 @pytest.mark.parametrize("task", NUMERIC)
 def test_a_run_that_goes_on_is_the_run_that_was_not_interrupted(task):
-    """Through ends of episodes, new draws and the delay lines: outputs and states afterwards."""
+    """Outputs and states agree through ends of episodes, new draws and the delay lines."""
     whole, other = made(task), made(task)
     act(whole, 7, seed=0)
     saved = whole.state()
-    act(other, 3, seed=9)  # whatever it did before is forgotten
+    act(other, 3, seed=9)  # its earlier history is overwritten
     other.reset(seed=77)
     other.load_state(saved)
     first, second = act(whole, 12, seed=1), act(other, 12, seed=1)
@@ -65,7 +65,7 @@ def test_a_run_that_goes_on_is_the_run_that_was_not_interrupted(task):
 
 
 def test_instruments_and_filters_go_on():
-    """Late fixes and samples on their way, walking biases, and what the filters know."""
+    """The state includes late fixes, delayed samples, drifting biases and the filters' estimates."""
     late = {"rate": 4.0, "latency": 0.3, "dropout": 0.2, "position": np.zeros(3)}
     finsrov = load_vehicle("finsrov")
     gauge, dvl = (
@@ -93,7 +93,7 @@ def test_instruments_and_filters_go_on():
 
 @pytest.mark.parametrize("by", ["steps", "success"])
 def test_ranges_that_grow_go_on_growing(by):
-    """A look at the successes falls into the second part only if the steps before are counted."""
+    """The evaluation of success falls into the second part only if earlier steps are counted."""
     growing = load_ranges("fossen_learn_to_swim").model_copy(
         update={"curriculum": Curriculum(by=by, episodes=1, narrow_at=0.0, widen_at=0.0, over=(0.0, 1000.0))}
     )
@@ -107,7 +107,7 @@ def test_ranges_that_grow_go_on_growing(by):
 
 
 def test_tethers_that_were_drawn_are_kept():
-    """Another episode's draw, in worlds that never saw it."""
+    """Draws of a saved episode are restored in worlds that never had them."""
     ranges = Ranges.model_validate({"name": "line", "tether": {"diameter": [0.005, 0.02]}})
     whole, other = (finssim.make("t1", worlds=4, seed=1, randomize=Randomization(ranges)) for _ in range(2))
     whole.reset()
@@ -117,7 +117,7 @@ def test_tethers_that_were_drawn_are_kept():
 
 
 def test_a_saved_state_is_a_copy():
-    """What happens afterwards does not change it."""
+    """Later steps do not change it."""
     environment = made("t1")
     saved = environment.state()
     before = {name: array.copy() for name, array in saved.items()}
@@ -127,7 +127,7 @@ def test_a_saved_state_is_a_copy():
 
 
 def test_loading_keeps_the_memory_of_the_arrays():
-    """Tensors that look at the arrays go on seeing them."""
+    """Tensors that share memory with the arrays remain valid."""
     environment = made("t1")
     place = environment.arrays.observation.ptr
     environment.load_state(environment.state())
@@ -135,7 +135,7 @@ def test_loading_keeps_the_memory_of_the_arrays():
 
 
 def test_a_state_of_another_environment_is_refused():
-    """Other numbers of worlds, or another task."""
+    """Another number of worlds or another task is refused."""
     saved = made("t1").state()
     with pytest.raises(EnvironmentSetupError, match=r"has shape \(6, .*expected \(5, .*same arguments"):
         made("t1", worlds=5).load_state(saved)

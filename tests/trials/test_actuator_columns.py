@@ -21,7 +21,7 @@ def trial(**channels):
 
 
 def test_they_are_channels_after_the_thrusters():
-    """Thrust by the curve, then the angle; the wrench of the inputs has the thrusters' part alone."""
+    """Thrust comes by the curve, then the angle; the wrench of the inputs contains the thrusters' part alone."""
     inputs = drive(trial(), TORPEDO)
     assert inputs.names == ("propeller", "rudder") and inputs.thrusters
     np.testing.assert_allclose(inputs.force[0], [1.6e-3 * (600.0 * np.pi / 30.0) ** 2, 0.1])
@@ -38,13 +38,13 @@ def test_they_are_channels_after_the_thrusters():
     ],
 )
 def test_what_cannot_be_is_refused(channels, words):
-    """A missing or unknown actuator, and a wrench in place of the thrusters' inputs."""
+    """Refused are a missing or unknown actuator, and a wrench in place of the thrusters' inputs."""
     with pytest.raises(CalibrationError, match=words):
         drive(trial(**channels), TORPEDO)
 
 
 def test_synthetic_trials_log_them():
-    """Applied values follow lag and rate of the command, which each step may give."""
+    """Applied values follow the command, which each step may give, with lag and rate limit."""
     n = 100
     programme = Programme(
         name="turn",

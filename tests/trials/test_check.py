@@ -1,4 +1,4 @@
-"""`trials check` finds what is wrong with a log, and says what it can and cannot identify."""
+"""`trials check` finds what is wrong with a log, and reports what it can and cannot identify."""
 
 import json
 import re
@@ -28,7 +28,7 @@ COLUMNS = ("u", "v", "w", "p", "q", "r", "ax", "ay", "az", "roll", "pitch", "yaw
 
 @pytest.fixture(scope="module")
 def simulated():
-    """Trials of the simulator with the noise of the vehicle's sensors, by axis."""
+    """Simulated trials with the noise of the vehicle's sensors, by axis."""
     every = {
         p.name: p
         for p in programmes(
@@ -42,7 +42,7 @@ def simulated():
 
 
 def changed(trial, header=None, **columns):
-    """The trial with columns replaced by functions of them, or taken away by None."""
+    """Return the trial with columns replaced by functions of them, or removed by None."""
     channels = dict(trial.channels)
     for name, change in columns.items():
         if change is None:
@@ -54,11 +54,11 @@ def changed(trial, header=None, **columns):
 
 
 REPORTS = {}
-"""Trials that were checked, by identity; they are kept, so that no identity comes twice."""
+"""Reports of checked trials by identity; the trials are kept so that no identity is reused."""
 
 
 def report(trial, vehicle=VEHICLE):
-    """The report of a trial, made once."""
+    """Return the report of a trial, computed once."""
     key = (id(trial), vehicle.sha256)
     if key not in REPORTS:
         REPORTS[key] = trial, check_trials([trial], vehicle)[0]
@@ -70,7 +70,7 @@ def axis(trial, name, vehicle=VEHICLE):
 
 
 def said(findings, code, severity=None):
-    """Values of the findings of a code, and of a severity where it is given."""
+    """Return the values of the findings with a code, and with a severity if given."""
     return [one.values for one in findings if one.code == code and severity in (None, one.severity)]
 
 
@@ -85,7 +85,8 @@ def negative(x):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["surge", "heave", "roll", "yaw"])
 def test_a_good_trial_is_usable_and_tells_its_axis(simulated, name):
-    """Nothing to complain of; mass and both dampings of the driven axis; nothing of an axis that rests."""
+    """There are no complaints; mass and both dampings are identifiable on the driven axis, nothing on an axis
+    at rest."""
     found = report(simulated[name])
     assert found.verdict == "usable", found.findings
     mine = axis(simulated[name], name)
@@ -95,7 +96,7 @@ def test_a_good_trial_is_usable_and_tells_its_axis(simulated, name):
 
 
 def test_a_dive_and_coast_tells_buoyancy_and_a_roll_pulse_the_restoring_moment(simulated):
-    """What only these trials can tell."""
+    """Only these trials can identify them."""
     assert axis(simulated["heave"], "heave").identifiability["buoyancy"].identifiable
     assert axis(simulated["roll"], "roll").identifiability["k"].identifiable
     assert "k" not in axis(simulated["yaw"], "yaw").identifiability
@@ -130,7 +131,7 @@ WRONG = {
 @pytest.mark.slow
 @pytest.mark.parametrize("case", WRONG)
 def test_wrong_signs_and_units_are_refused(simulated, case):
-    """One convention changed in a good trial is found, named, and nothing may rest on it."""
+    """One changed convention in a good trial is found and named, and the trial is unusable."""
     name, columns, code, values = WRONG[case]
     trial = changed(simulated[name], **columns)
     assert report(trial).verdict == "refused"
@@ -140,14 +141,15 @@ def test_wrong_signs_and_units_are_refused(simulated, case):
 
 
 def test_a_heading_that_is_turned_against_the_position_is_found(simulated):
-    """Motion capture whose x axis is not the compass's: 90 degrees between them."""
+    """The x axis of the motion capture and the compass differ by 90 degrees."""
     trial = changed(simulated["surge"], yaw=lambda y: y + np.pi / 2)
     (disagreement,) = told(trial, "heading_disagrees", "care")
     assert disagreement["angle"] == pytest.approx(-90.0, abs=2.0)
 
 
 def test_noise_of_the_heading_is_not_taken_for_a_wrong_sign():
-    """1.4 degrees of noise on a heading that hardly moves: the changes of a smoothed heading are mostly noise."""
+    """With 1.4 degrees of noise on a heading that hardly moves, changes of the smoothed heading are mostly
+    noise."""
     for seed in (7, 15, 26, 27, 47, 53, 117):
         rng = np.random.default_rng(seed)
         t = np.arange(0.0, 8.0, 0.2)
@@ -160,7 +162,8 @@ def test_noise_of_the_heading_is_not_taken_for_a_wrong_sign():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["bluerov2_einarsson", "bluerov2_heavy_morgan"])
 def test_the_buoyancy_of_the_vehicle_file_is_not_taken_for_a_wrong_sign(name):
-    """Pushes of 2 % against a buoyancy of 4 N, and against a weight of 7 N: the inputs take energy out of heave."""
+    """Pushes of 2 % against a buoyancy of 4 N and against a weight of 7 N: the inputs remove energy from
+    heave."""
     vehicle = load_vehicle(name)
     weak = programmes(["heave"], vehicle, levels={"heave": (0.02 * vehicle.wrench_limits[2],)})
     trials = simulate_programme(weak, vehicle, seed=3, columns=COLUMNS, inputs=("wrench",))
@@ -169,7 +172,7 @@ def test_the_buoyancy_of_the_vehicle_file_is_not_taken_for_a_wrong_sign(name):
 
 
 def test_a_depth_in_another_unit_is_told(simulated):
-    """Feet and centimetres, against z and against w."""
+    """Feet and centimetres are detected, against z and against w."""
     trial = simulated["heave"]
     (against_z,) = told(changed(trial, depth=lambda d: d / 0.3048), "speed_ratio", "care")
     assert against_z["ratio"] == pytest.approx(0.3048, abs=0.02)
@@ -178,7 +181,7 @@ def test_a_depth_in_another_unit_is_told(simulated):
 
 
 def test_a_heading_that_samples_slowly_or_a_vehicle_on_its_nose_has_no_drift():
-    """A turn of 4 rad/s seen by a heading of 1 Hz, and a somersault, in which the heading jumps by half a turn."""
+    """A turn of 4 rad/s with a heading at 1 Hz, and a somersault, in which the heading jumps by half a turn."""
     t = np.arange(0.0, 20.0, 0.02)
     spin = Trial(
         name="spin",
@@ -206,7 +209,8 @@ def test_a_vehicle_that_rolls_without_a_measured_tilt_is_not_taken_as_level():
 
 
 def test_five_hertz_with_wrench_and_velocity_only(simulated):
-    """Every tenth row, two columns: the surge axis is still told, the lag is not, the rest has no velocity."""
+    """With every tenth row and two columns, surge is still identifiable; the lag is not, and other axes have
+    no velocity."""
     trial = simulated["surge"]
     rows = slice(None, None, 10)
     trial = replace(
@@ -220,7 +224,7 @@ def test_five_hertz_with_wrench_and_velocity_only(simulated):
 
 
 def test_gyro_without_velocity_tells_the_turns_only(simulated):
-    """No u, v, w, no position: yaw from the gyroscope, surge from nothing."""
+    """Without u, v, w and position, yaw is identifiable from the gyroscope, surge is not."""
     gone = dict.fromkeys(("u", "v", "w", "x", "y", "z", "depth", "roll", "pitch", "yaw"))
     assert axis(changed(simulated["yaw"], **gone), "yaw").identifiability["d1"].identifiable
     trial = changed(simulated["surge"], **gone)
@@ -228,7 +232,7 @@ def test_gyro_without_velocity_tells_the_turns_only(simulated):
 
 
 def test_one_level_without_a_coast_cannot_part_linear_and_quadratic_drag(simulated):
-    """The steady part of a step alone: one speed, one number; and no mass."""
+    """The steady part of a step alone is one speed and gives one number, and no mass."""
     trial = simulated["surge"]
     u = trial.series("u")[1]
     steady = np.flatnonzero(np.abs(trial.channels["tau_x"]) > 0.9 * np.abs(trial.channels["tau_x"]).max())[
@@ -247,7 +251,7 @@ def test_one_level_without_a_coast_cannot_part_linear_and_quadratic_drag(simulat
 
 
 def test_a_passive_trial_tells_against_the_restoring_moment_only(simulated):
-    """A swing that rings down, thrusters off."""
+    """The trial is a decaying swing with thrusters off."""
     t = np.arange(0.0, 12.0, 0.02)
     roll = 0.3 * np.exp(-0.3 * t) * np.cos(3.0 * t)
     channels = {"roll": roll, "pitch": 0.0 * t, "p": np.gradient(roll, t), "q": 0.0 * t, "r": 0.0 * t}
@@ -259,7 +263,7 @@ def test_a_passive_trial_tells_against_the_restoring_moment_only(simulated):
 
 
 def test_the_check_of_a_passive_trial_agrees_with_the_fit():
-    """Twelve speeds at 1 Hz are enough for both; neither takes a spin that does not slow down."""
+    """Twelve speeds at 1 Hz are enough for both; both reject a spin that does not slow down."""
     t = np.arange(0.0, 12.0)
     for rate, reason in (
         (0.6 / (1.0 + 0.4 * t), ""),
@@ -276,7 +280,8 @@ def test_the_check_of_a_passive_trial_agrees_with_the_fit():
 
 
 def test_the_check_agrees_with_the_fit_on_swings_and_on_inputs_that_are_zero(simulated):
-    """A surge trial with an IMU alone shows the pitch that it starts; inputs that push nothing show nothing."""
+    """A surge trial with an IMU alone identifies the pitch that it excites; inputs without thrust identify
+    nothing."""
     columns = {name: None for name in COLUMNS if name not in ("p", "q", "r", "ax", "ay", "az")}
     for header, swinging in (({"axis": ()}, ("roll", "pitch")), ({"axis": ("surge",)}, ())):
         imu = changed(simulated["surge"], header=header, **columns)
@@ -293,7 +298,7 @@ def test_the_check_agrees_with_the_fit_on_swings_and_on_inputs_that_are_zero(sim
 
 
 def test_no_inputs_pulses_without_a_controller_and_strange_thrusters_are_refused(simulated):
-    """Each with the reason, and the motion is looked at all the same."""
+    """Each is refused with the reason, and the motion is still checked."""
     gone = {c: None for c in simulated["surge"].channels if c.startswith("tau")}
     bare = changed(simulated["surge"], **gone)
     assert "no input columns" in told(bare, "unusable", "refused")[0]["reason"]
@@ -309,14 +314,14 @@ def test_no_inputs_pulses_without_a_controller_and_strange_thrusters_are_refused
 
 
 def test_no_vehicle_is_refused_but_the_sampling_is_reported(simulated):
-    """Nobody said what it was."""
+    """Nothing names the vehicle."""
     found = check_trials([changed(simulated["surge"], header={"vehicle": None})])[0]
     assert found.verdict == "refused" and found.streams and not found.axes
     assert said(found.findings, "no_vehicle", "refused")
 
 
 def test_gaps_rates_and_jitter_are_measured(simulated):
-    """Four seconds of velocity missing in fourteen; depth at its own rate."""
+    """Velocity is missing for four of fourteen seconds; depth has its own rate."""
     trial = simulated["surge"]
     missing = (trial.t > 5.0) & (trial.t < 9.0)
     trial = changed(trial, **{c: (lambda y: np.where(missing, np.nan, y)) for c in ("u", "v", "w")})
@@ -339,7 +344,7 @@ def test_heights_above_the_surface_are_told(simulated):
 
 
 def test_stuck_held_and_clipped_sensors_are_found(simulated):
-    """A gyroscope that stops, a velocity that comes at a fifth of the rate, a rate beyond the sensor's range."""
+    """A gyroscope stops, a velocity has a fifth of the rate, and a rate exceeds the sensor's range."""
     trial = simulated["yaw"]
     i = np.arange(len(trial.t))
     stuck = changed(trial, r=lambda y: np.where((trial.t > 4.0) & (trial.t < 7.0), y[200], y))
@@ -355,7 +360,7 @@ def test_stuck_held_and_clipped_sensors_are_found(simulated):
 
 
 def test_speeds_that_no_vehicle_has_are_told_and_left_out(simulated):
-    """Rare ones; where they are many, the unit is wrong and the trial is refused."""
+    """This applies to rare ones; if they are many, the unit is wrong and the trial is refused."""
 
     def spiked(y):
         return np.where(np.arange(len(y)) % 100 == 50, 50.0, y)
@@ -369,7 +374,7 @@ def test_speeds_that_no_vehicle_has_are_told_and_left_out(simulated):
 
 
 def test_saturation_is_found(simulated):
-    """A commanded wrench that the thrusters cannot give, and thrusters at their limits."""
+    """A commanded wrench exceeds the thrusters, and thrusters are at their limits."""
     commanded = changed(simulated["surge"], header={"inputs": "commanded"}, tau_x=lambda y: 10.0 * y)
     assert told(commanded, "command_beyond", "care")[0]["column"] == "tau_x"
     bare = changed(
@@ -381,13 +386,13 @@ def test_saturation_is_found(simulated):
 
 
 def test_an_axis_that_the_header_names_but_nothing_drives_is_told(simulated):
-    """trial.yaml says sway."""
+    """trial.yaml names sway."""
     assert told(changed(simulated["surge"], header={"axis": ("sway",)}), "axis_still") == [{"axis": "sway"}]
 
 
 @pytest.mark.slow
 def test_between_trials(simulated):
-    """Duplicates, roles, vehicles."""
+    """Checks between trials find duplicates and compare roles and vehicles."""
     surge, yaw = simulated["surge"], simulated["yaw"]
     twice = check_trials([surge, replace(surge, name="again")], VEHICLE)
     assert [r.verdict for r in twice] == ["usable", "refused"]
@@ -404,7 +409,7 @@ def test_between_trials(simulated):
 
 @pytest.mark.slow
 def test_the_report_is_json_and_fits_a_hundred_columns(simulated):
-    """Programs get plain finite values; people lines that do not wrap."""
+    """JSON contains plain finite values; the printed lines do not wrap."""
     reports = check_trials(list(simulated.values()), VEHICLE)
     text = json.dumps({"trials": [one.as_json() for one in reports]}, allow_nan=False)
     assert json.loads(text)["trials"][0]["axes"]["surge"]["identifiability"]["m_eff"]["identifiable"] is True
@@ -417,7 +422,7 @@ def test_the_report_is_json_and_fits_a_hundred_columns(simulated):
 
 
 def test_the_command_reads_folders_and_reports_broken_ones(simulated, tmp_path, capsys):
-    """One good trial, one that is no table: both are in the report."""
+    """A good trial and a file that is not a table both appear in the report."""
     write_trial(simulated["surge"], tmp_path / "a")
     (tmp_path / "b").mkdir()
     (tmp_path / "b" / "data.csv").write_text("nothing\n")
@@ -429,7 +434,7 @@ def test_the_command_reads_folders_and_reports_broken_ones(simulated, tmp_path, 
 
 
 def test_of_many_columns_with_one_remark_four_are_named():
-    """A gap in six columns is one remark, which names four of them and counts the others."""
+    """A gap in six columns gives one finding, which names four of them and counts the others."""
     t = np.arange(0.0, 20.0, 0.05)
     t[100:] += 5.0
     channels = {name: 0.1 * np.sin(t + i) for i, name in enumerate(("p", "q", "r", "u", "v", "w"))}

@@ -1,4 +1,4 @@
-"""Foreign conventions: known physical events come out as our signs say, whatever frame they were logged in."""
+"""Known physical events have FinsSim's signs, whatever frame they were logged in."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ NED = "frame: {body: FRD, world: NED}"
 
 
 def log(folder, columns, how=NED):
-    """A trial imported from these columns, values constant over three rows or given as lists."""
+    """Return a trial imported from these columns, values constant over three rows or given as lists."""
     n = 3
     filled = {"t": [0.0, 1.0, 2.0]} | {k: np.broadcast_to(v, n).tolist() for k, v in columns.items()}
     folder.mkdir(exist_ok=True)
@@ -24,7 +24,7 @@ def log(folder, columns, how=NED):
 
 
 def test_a_dive_with_the_nose_down_in_ned(tmp_path):
-    """NED: z grows, pitch is negative, w points down. Ours: z falls, pitch is positive (z is up)."""
+    """In NED z grows, pitch is negative and w points down; here z falls and pitch is positive (z is up)."""
     trial = log(
         tmp_path / "a",
         {"z": [1.0, 2.0, 3.0], "pitch": -0.3, "roll": 0.0, "yaw": 0.1, "w": 0.2, "depth": [1, 2, 3]},
@@ -32,13 +32,14 @@ def test_a_dive_with_the_nose_down_in_ned(tmp_path):
     assert np.all(np.diff(trial.channels["z"]) < 0.0)
     assert trial.channels["pitch"][0] == pytest.approx(0.3)
     assert trial.channels["w"][0] == pytest.approx(-0.2)
-    np.testing.assert_array_equal(trial.channels["depth"], [1, 2, 3])  # depth is depth everywhere
+    np.testing.assert_array_equal(trial.channels["depth"], [1, 2, 3])  # depth is the same in all frames
     ahead = quat_rotate(quat_from_euler(0.0, trial.channels["pitch"][0], 0.0), [1.0, 0.0, 0.0])
     assert ahead[2] < 0.0
 
 
 def test_a_right_turn_in_ned(tmp_path):
-    """NED: yaw and r grow to the right, sway to starboard. Ours: the other way; surge and roll keep their signs."""
+    """In NED yaw and r grow to the right, sway to starboard; here the opposite; surge and roll keep their
+    signs."""
     columns = {
         "yaw": [0.0, 0.1, 0.2],
         "r": 0.1,
@@ -59,7 +60,7 @@ def test_a_right_turn_in_ned(tmp_path):
 
 
 def test_an_accelerometer_at_rest_reads_up_in_every_frame(tmp_path):
-    """FRD logs -9.81 on z at rest; ours is +9.81."""
+    """FRD logs -9.81 on z at rest; FinsSim uses +9.81."""
     c = log(tmp_path / "a", {"ax": 0.0, "ay": 0.0, "az": -9.81}).channels
     assert c["az"][0] == pytest.approx(9.81)
 
@@ -70,7 +71,7 @@ def test_an_accelerometer_at_rest_reads_up_in_every_frame(tmp_path):
 def test_one_attitude_in_four_pairs_of_frames(tmp_path, body, world, form):
     """The same attitude logged with either body and either world axes reads as one attitude."""
     q = quat_from_euler([0.1, -0.4, 0.7], [0.2, 0.5, -0.9], [0.3, 2.0, -2.5])
-    half_turn = np.array([1.0, 0.0, 0.0, 0.0])  # R = A: ours to Fossen's and back
+    half_turn = np.array([1.0, 0.0, 0.0, 0.0])  # R = A: FinsSim's to Fossen's and back
     logged = q
     if world == "NED":
         logged = quat_multiply(half_turn, logged)
@@ -92,7 +93,7 @@ def test_one_attitude_in_four_pairs_of_frames(tmp_path, body, world, form):
 
 
 def test_a_heading_alone_turns_with_the_world_only(tmp_path):
-    """The x axis is forward in both body conventions, so a heading knows only the world's."""
+    """The x axis is forward in both body conventions, so a heading depends only on the world frame."""
     how = "frame: {{body: {}, world: {}}}"
     for body, world, sign in [("FRD", "z_up", 1), ("FLU", "NED", -1), ("FRD", "NED", -1)]:
         trial = log(tmp_path / (body + world), {"yaw": [0.1, 3.0, 4.0]}, how.format(body, world))
@@ -100,7 +101,7 @@ def test_a_heading_alone_turns_with_the_world_only(tmp_path):
 
 
 def test_a_forgotten_convention_is_noticed(tmp_path):
-    """With body axes named that the attitude does not have, the vehicle lies on its back, and a note says so."""
+    """With body axes that are not those of the attitude, the vehicle appears upside down, and a note says so."""
     trial = log(tmp_path / "a", {"roll": 0.1, "pitch": 0.0, "yaw": 0.0}, "frame: {body: FRD, world: z_up}")
     assert "upside_down" in {one.code for one in trial.findings}
     upright = log(tmp_path / "b", {"roll": 0.1, "pitch": 0.0, "yaw": 0.0})
@@ -128,7 +129,7 @@ def test_a_forgotten_convention_is_noticed(tmp_path):
     ],
 )
 def test_units_become_si(unit, column, si):
-    """One of the unit is so many of the canonical one."""
+    """One unit of the column is this many canonical units."""
     assert factor(unit, column) == pytest.approx(si, rel=1e-6)
 
 
@@ -147,7 +148,8 @@ def test_a_unit_of_the_wrong_kind_is_refused(unit, column, sentence):
 
 
 def test_units_names_and_offsets_come_first(tmp_path):
-    """Scale, offset and unit come before frames: degrees in NED with a compass error of 10° to the right."""
+    """Scale, offset and unit are applied before frames: degrees in NED with a compass error of 10° to the
+    right."""
     how = "columns: {yaw: {column: hdg, offset: 10, unit: deg}, force_T1: {column: T1, unit: kgf}}\n" + NED
     c = log(tmp_path / "a", {"hdg": 90.0, "T1": 2.0}, how).channels
     assert np.rad2deg(c["yaw"][0]) == pytest.approx(-100.0)
@@ -155,7 +157,8 @@ def test_units_names_and_offsets_come_first(tmp_path):
 
 
 def test_a_time_offset_moves_one_stream():
-    """A group is moved, one of its columns by its own offset; nothing is interpolated, rows are a union."""
+    """A group is shifted, and one of its columns by its own offset; nothing is interpolated, rows are a
+    union."""
     t = np.arange(4) * 0.1
     stream = Stream(source="log", t=t, channels={name: np.arange(4.0) for name in ("u", "roll", "yaw")})
     table = merge(moved_in_time([stream], {"attitude": 0.05, "yaw": -0.1}))
@@ -167,7 +170,7 @@ def test_a_time_offset_moves_one_stream():
 
 
 def test_phases_stay_with_the_clock(tmp_path):
-    """Moving a stream in time leaves the phases where the clock had them."""
+    """Shifting a stream in time does not move the phases."""
     (tmp_path / "data.csv").write_text("t,u,r,phase\n0,1,1,baseline\n1,2,2,excitation\n2,3,3,coast\n")
     (tmp_path / "map.yaml").write_text("time: t\ncolumns: [u, r]\nphase: phase\ntime_offsets: {r: 0.5}")
     (trial,) = read_trials([tmp_path / "data.csv"], column_map=tmp_path / "map.yaml")
@@ -184,6 +187,6 @@ def test_phases_stay_with_the_clock(tmp_path):
     ],
 )
 def test_a_map_of_what_the_log_has_not_is_refused(tmp_path, how, message):
-    """One sentence that says what there is."""
+    """The refusal is one sentence that lists what exists."""
     with pytest.raises(CalibrationError, match=message):
         log(tmp_path / "a", {"u": 1.0}, how)

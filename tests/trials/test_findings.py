@@ -1,4 +1,5 @@
-"""Findings: every code has one sentence and is used, and a sentence names only what its producers give."""
+"""Every code of a finding has one sentence and is used, and a sentence names only values that its producers
+give."""
 
 import ast
 import string
@@ -15,7 +16,7 @@ SOURCE = Path(finssim.__file__).parent
 
 
 def producers() -> dict[str, list[tuple[str, set[str] | None]]]:
-    """Code -> place and names of the values of every call of `finding`; None where a mapping gives them."""
+    """Return code -> location and value names of every call of `finding`; None where a mapping gives them."""
     found = defaultdict(list)
     for path in SOURCE.rglob("*.py"):
         text = path.read_text(encoding="utf-8")
@@ -33,7 +34,7 @@ def producers() -> dict[str, list[tuple[str, set[str] | None]]]:
 
 
 def fields(code: str) -> set[str]:
-    """Names that the sentence of a code fills in."""
+    """Return the names that the sentence of a code fills in."""
     return {name for _, name, _, _ in string.Formatter().parse(wordings()[code][1]) if name}
 
 
@@ -43,7 +44,7 @@ def test_every_code_is_worded_and_used():
 
 
 def test_a_sentence_names_exactly_what_its_producers_give():
-    """But for `edges_empty`, whose sides are for programs and whose shares are for people."""
+    """`edges_empty` is exempt: its sides are for programs, its shares for people."""
     for code, calls in producers().items():
         for place, given in calls:
             extra = {"sides"} if code == "edges_empty" else set()
@@ -61,7 +62,7 @@ def test_what_holds_for_several_subjects_is_one_sentence():
 
 
 def test_json_has_code_values_and_sentence():
-    """Numbers of NumPy become plain, what is not finite becomes None."""
+    """Numbers of NumPy become plain, and non-finite ones None."""
     record = finding("stuck", "u", value=np.float64(0.5), span=np.nan, start=np.float32(2.0)).as_json()
     assert record["values"] == {"value": 0.5, "span": None, "start": 2.0}
     assert (record["code"], record["severity"], record["subject"]) == ("stuck", "care", "u")

@@ -1,4 +1,4 @@
-"""Recorded inputs become the wrench that acted, whatever was logged, or are refused with what is missing."""
+"""Recorded inputs of any kind become the wrench that acted, or are refused with what is missing."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ RPM = 60.0 / (2.0 * np.pi)
 
 
 def trial(channels, t=None, **header):
-    """A trial of these columns."""
+    """Return a trial of these columns."""
     n = len(next(iter(channels.values())))
     t = np.arange(n) * 0.02 if t is None else t
     return Trial(
@@ -25,7 +25,7 @@ def trial(channels, t=None, **header):
 
 
 def forces(vehicle, n=40, seed=0):
-    """Smooth thrusts within the limits, (n, k)."""
+    """Return smooth thrusts within the limits, (n, k)."""
     rng = np.random.default_rng(seed)
     k = len(vehicle.thrusters)
     phase, rate = rng.uniform(0.0, 6.0, k), rng.uniform(1.0, 3.0, k)
@@ -33,7 +33,7 @@ def forces(vehicle, n=40, seed=0):
 
 
 def propelled(name):
-    """A vehicle with its thrusters alone."""
+    """Return a vehicle with its thrusters alone."""
     return load_vehicle(name).model_copy(update={"actuators": {}})
 
 
@@ -76,7 +76,8 @@ def test_one_wrench_from_every_kind_of_input(vehicle, kind):
 
 
 def test_moments_are_about_the_wrench_reference_unless_said_otherwise():
-    """A force along x through a point 0.08 m below the origin pitches the vehicle by -0.08 m times it."""
+    """A force along x through a point 0.08 m below the origin gives a pitch moment of -0.08 m times the
+    force."""
     vehicle = load_vehicle("finsrov")
     height = float(vehicle.wrench_reference[2])
     assert height < 0.0
@@ -93,7 +94,7 @@ def test_axes_of_a_wrench_without_a_column_are_zero_and_it_is_said():
 
 
 def test_what_tells_most_comes_first(vehicle):
-    """Shaft speeds before forces before a wrench before commands; a kind for some thrusters only is passed over."""
+    """Order: shaft speeds, forces, a wrench, commands; a kind that covers only some thrusters is skipped."""
     names = vehicle.thruster_names
     channels = {f"command_{name}": np.ones(5) for name in names} | {"tau_x": np.full(5, 3.0)}
     assert drive(trial(channels), vehicle).source == "tau"
@@ -106,7 +107,7 @@ def test_what_tells_most_comes_first(vehicle):
 
 
 def test_commands_pass_the_motors_and_forces_do_not(vehicle):
-    """`inputs` decides: what was asked for arrives later by delay and lag."""
+    """`inputs` decides: commands act after delay and lag."""
     n = len(vehicle.thrusters)
     step = np.where(np.arange(100)[:, None] >= 20, 0.5 * vehicle.force_limits[1], 0.0)
     channels = {f"command_{name}": step[:, i] for i, name in enumerate(vehicle.thruster_names)}
@@ -124,7 +125,7 @@ def test_commands_pass_the_motors_and_forces_do_not(vehicle):
 
 
 def test_pulse_widths_become_forces_through_the_speed_controller():
-    """The pulse that makes a speed makes that speed's thrust; a higher battery voltage makes more."""
+    """The pulse that gives a speed gives that speed's thrust; a higher battery voltage gives more."""
     vehicle = load_vehicle("bluerov2_heavy")
     if any(thruster.esc is None for thruster in vehicle.thrusters.values()):
         pytest.skip("the catalogue gives no speed controller")
@@ -142,7 +143,8 @@ def test_pulse_widths_become_forces_through_the_speed_controller():
 
 
 def test_inputs_of_another_rate_are_held_or_go_straight():
-    """A command holds until the next; a measured force goes in a straight line; `inputs_between` overrides."""
+    """A command is held until the next, a measured force is interpolated linearly; `inputs_between`
+    overrides."""
     vehicle = propelled("lauv")
     name = vehicle.thruster_names[0]
     sparse = np.where(np.arange(21) % 10 == 0, np.arange(21) / 10.0, np.nan)
@@ -158,7 +160,7 @@ def test_inputs_of_another_rate_are_held_or_go_straight():
 
 
 def test_forces_of_thrusters_sampled_at_different_times_are_brought_together(vehicle):
-    """Telemetry of several motor controllers never comes in one row."""
+    """Telemetry of several motor controllers never shares rows."""
     n, k = 200, len(vehicle.thrusters)
     f = forces(vehicle, n)
     rows = np.arange(n)
@@ -170,13 +172,13 @@ def test_forces_of_thrusters_sampled_at_different_times_are_brought_together(veh
     inside = slice(k, n - k)
     t = np.arange(n) * 0.02
     scale = vehicle.force_limits[1]
-    # Straight lines between samples k rows apart, of sines of at most 3 rad/s: h² ω² / 8 of the amplitude.
+    # Linear interpolation between samples k rows apart, of sines up to 3 rad/s: h² ω² / 8 of the amplitude.
     tolerance = (k * 0.02 * 3.0) ** 2 / 8.0
     np.testing.assert_allclose(found.at(t)[inside] / scale, f[inside] / scale, atol=tolerance)
 
 
 def test_nothing_is_known_outside_the_inputs_or_in_their_gaps():
-    """A measured force is not made up where it was not measured; a command holds while the recording goes on."""
+    """A measured force is not extrapolated; a command is held while the recording continues."""
     vehicle = propelled("lauv")
     name = vehicle.thruster_names[0]
     t = np.arange(300) * 0.02
@@ -195,7 +197,7 @@ def test_nothing_is_known_outside_the_inputs_or_in_their_gaps():
 
 
 def test_a_passive_trial_needs_no_inputs():
-    """Thrusters off: the wrench is zero throughout, and six axes can take a disturbance."""
+    """With thrusters off the wrench is zero throughout, and six axes may take a disturbance."""
     vehicle = load_vehicle("bluerov2")
     made = trial({"p": np.zeros(5)}, passive=True)
     found = drive(made, vehicle)
@@ -220,7 +222,7 @@ def test_a_passive_trial_needs_no_inputs():
     ],
 )
 def test_inputs_that_cannot_be_used_are_refused_with_what_is_missing(channels, said):
-    """One sentence that names the trial, the column and what to do."""
+    """The refusal is one sentence with the trial, the column and the remedy."""
     values = load_vehicle("bluerov2").values()
     for thruster in values["thrusters"].values():
         thruster.pop("esc", None)
@@ -232,7 +234,7 @@ def test_inputs_that_cannot_be_used_are_refused_with_what_is_missing(channels, s
 
 @pytest.mark.parametrize("rate", [5.0, 50.0])
 def test_a_wrench_that_jumps_between_exact_levels_was_held(rate):
-    """Steps set by a program act from their row on; the same steps passed through a motor, or noisy, are sampled."""
+    """Steps set by a program act from their row on; the same steps after a motor, or with noise, are sampled."""
     t = np.arange(0.0, 6.0, 1.0 / rate)
     steps = np.where((t > 1.9) & (t < 3.9), 6.0, 0.0)
     lagged = np.where(t > 1.9, 6.0 * (1.0 - np.exp(-(t - 1.9) / 0.5)), 0.0)
@@ -259,8 +261,8 @@ def test_a_wrench_that_jumps_between_exact_levels_was_held(rate):
     ],
 )
 def test_inputs_have_an_end(after, last, ends, pushes):
-    """A stream of pulses that stops while the recording goes on: unknown from there, held or zero where the header says
-    so; a last pulse of no thrust is held."""
+    """If a stream of pulses stops while the recording continues, it is unknown from there, or held or zero if the
+    header says so; a last pulse without thrust is held."""
     vehicle = load_vehicle("bluerov2")
     t = np.arange(0.0, 10.0, 0.1)
     pulses = np.where(t < 2.0, 1500.0, 1700.0)
@@ -279,7 +281,8 @@ def test_inputs_have_an_end(after, last, ends, pushes):
 
 
 def test_pulses_in_another_unit_are_not_fitted():
-    """Normalised values and ms taken for µs; a column of zeros, which a disarmed autopilot logs, is none."""
+    """Tested with normalised values and ms taken for µs; a column of zeros, which a disarmed autopilot logs,
+    is no input."""
     t = np.linspace(0.0, 4.0, 40)
     for scale, wrong in ((1.0, False), (1e-3, True), (0.0, False)):
         made = trial(
@@ -301,7 +304,8 @@ def test_pulses_in_another_unit_are_not_fitted():
     ],
 )
 def test_what_no_vehicle_can_have_done_is_not_fitted(speed, passive, code):
-    """mm/s taken for m/s; five times the terminal speed; energy that thrust of 1 N over 0.8 s cannot give to 12 kg."""
+    """mm/s taken for m/s; five times the terminal speed; energy that thrust of 1 N over 0.8 s cannot give to
+    12 kg."""
     slow = np.full(40, 0.0)
     given = {"tau_x": slow + 1.0} if not passive else {}
     made = trial({"u": np.linspace(0.0, speed, 40), "v": slow, "w": slow, **given}, passive=passive)

@@ -1,4 +1,4 @@
-"""Commanded forces through the motors: the simulator's actuation, and closed forms."""
+"""Commanded forces through the motors agree with the simulator's actuation and with closed forms."""
 
 import numpy as np
 import pytest
@@ -19,9 +19,9 @@ from finssim.vehicles import load_vehicle
     ],
 )
 def test_thrust_agrees_with_the_simulator(name, changes, step):
-    """Delay, dead zone, limits, lag and slew, in force and in speed: what the engine delivers at every step's end.
+    """With delay, dead zone, limits, lag and slew, in force and in speed, it equals the engine at every step.
 
-    The engine limits the slew once a substep, so it is wrong by up to the slew of one substep; else single precision.
+    The engine limits the slew once a substep, which allows an error of one substep's slew; else single precision.
     """
     vehicle = load_vehicle(name).replace(changes).model_copy(update={"actuators": {}})
     n, steps, substeps = len(vehicle.thrusters), 200, 50
@@ -46,7 +46,7 @@ def test_thrust_agrees_with_the_simulator(name, changes, step):
 
 
 def test_a_step_of_force_is_an_exponential():
-    """T = F (1 - exp(-(t - delay) / time_constant)) after the delay, at times that fall on no sample."""
+    """T = F (1 - exp(-(t - delay) / time_constant)) after the delay, at times between samples."""
     vehicle = load_vehicle("finsrov")
     motors = channel_motors(vehicle)
     command = np.zeros((3, 8))
@@ -59,7 +59,7 @@ def test_a_step_of_force_is_an_exponential():
 
 
 def test_a_slew_limit_is_a_ramp_and_then_an_exponential():
-    """While the way to go exceeds slew x time_constant the force climbs by the slew alone."""
+    """While the remaining step exceeds slew x time_constant, the force rises at the slew rate."""
     vehicle = load_vehicle("finsrov").replace({"thrusters.*.slew": 10.0})
     motors = channel_motors(vehicle)
     command = np.array([[0.0], [7.0]]) * np.ones(8)

@@ -1,4 +1,4 @@
-"""Samples that a log repeats are told from a vehicle at rest and from coarse numbers."""
+"""Repeated samples in a log are distinguished from a vehicle at rest and from coarse numbers."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ T = np.arange(1000) * 0.02
 
 @pytest.mark.parametrize("rate", [5.0, 10.0, 12.5, 18.0, 25.0])
 def test_a_slow_stream_in_a_fast_table_keeps_its_own_samples(rate):
-    """The first row of every run is the sample, whether or not the rates divide."""
+    """The first row of every run is the sample, also if the rates do not divide."""
     ticks = np.floor(T * rate + 1e-9)
     values = np.stack([np.sin(ticks / rate), np.cos(ticks / rate)], axis=-1)
     new = new_samples(values)
@@ -19,13 +19,13 @@ def test_a_slow_stream_in_a_fast_table_keeps_its_own_samples(rate):
 
 
 def test_a_vehicle_at_rest_repeats_nothing():
-    """Long runs of one value beside samples that all differ are rest, or a simulation."""
+    """Long runs of one value among samples that all differ are rest, or a simulation."""
     rest = np.where((T > 4.0) & (T < 12.0), np.sin(T), 0.0)[:, None]
     assert new_samples(rest).all() and new_samples(np.zeros((1000, 3))).all()
 
 
 def test_coarse_numbers_are_no_repeats():
-    """A pressure sensor of 2 mm steps in a slow dive, with noise of its own size."""
+    """Tested with a pressure sensor of 2 mm resolution in a slow dive, with noise of the same size."""
     rng = np.random.default_rng(0)
     for size in (0.0005, 0.002):
         depth = np.round((0.05 * T + size * rng.normal(size=1000)) / 0.002) * 0.002
@@ -33,14 +33,15 @@ def test_coarse_numbers_are_no_repeats():
 
 
 def test_rest_in_a_repeated_stream_makes_no_gap():
-    """While the vehicle rests, the slow stream is taken to go on at its own rate."""
+    """While the vehicle is at rest, the slow stream is assumed to continue at its own rate."""
     ticks = np.floor(T * 10.0 + 1e-9) / 10.0
     values = np.where(ticks < 5.0, 0.0, np.sin(ticks))[:, None]
     assert np.diff(T[new_samples(values)]).max() < 0.11
 
 
 def test_repeats_are_emptied_when_a_trial_is_read_and_the_rest_is_left(tmp_path):
-    """Velocity at 10 Hz and gyro at 50 Hz in one table; a held command stays, and reading again changes nothing."""
+    """Velocity is at 10 Hz and gyro at 50 Hz in one table; a held command is kept, and reading again changes
+    nothing."""
     ticks = np.floor(T * 10.0 + 1e-9) / 10.0
     channels = {"u": np.sin(ticks), "v": np.cos(ticks), "r": np.sin(T), "tau_x": np.floor(ticks)}
     write_trial(Trial(name="made", t=T, channels=channels), tmp_path / "made")

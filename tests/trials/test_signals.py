@@ -1,4 +1,4 @@
-"""Velocity, acceleration and attitude of the body origin, measured or derived, against a body whose motion is known."""
+"""Measured or derived velocity, acceleration and attitude of the body origin, against a known motion."""
 
 from dataclasses import replace
 
@@ -18,17 +18,17 @@ T = np.arange(1000) * 0.01
 
 
 def trial(channels, t=T, **header):
-    """A trial of these columns, with the thrusters off."""
+    """Return a trial of these columns, with the thrusters off."""
     return Trial(name="made", t=t, channels=channels, header=Header(**({"passive": True} | header)))
 
 
 def inner(m, margin=0.5):
-    """Rows away from the ends, where derivatives are best."""
+    """Return the rows away from the ends, where derivatives are most accurate."""
     return (m.t > m.t[0] + margin) & (m.t < m.t[-1] - margin)
 
 
 def assert_close(values, truth, rows, atol):
-    """Equal up to atol on the rows named, with nothing unknown there."""
+    """Assert that the given rows are finite and equal the truth up to atol."""
     assert np.isfinite(values[rows]).all()
     np.testing.assert_allclose(values[rows], truth[rows], atol=atol)
 
@@ -36,7 +36,7 @@ def assert_close(values, truth, rows, atol):
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("turns", [False, True])
 def test_what_is_measured_at_the_origin_is_the_motion(seed, turns):
-    """Also upside down; nothing is made up of what was not measured."""
+    """This holds upside down too; what was not measured stays unknown."""
     body = MovingBody(seed, turns=turns)
     m = motion(trial(body.columns(T, "velocity", "rates", "quaternion")), VEHICLE)
     assert_close(m.nu, body.nu(m.t), inner(m), 1e-5)
@@ -45,7 +45,7 @@ def test_what_is_measured_at_the_origin_is_the_motion(seed, turns):
 
 
 def test_acceleration_without_gravity_is_recognised():
-    """Kinematic accelerations, as optical systems give them, are told from specific force by their size."""
+    """Kinematic accelerations, as from optical systems, are distinguished from specific force by their size."""
     body = MovingBody(3)
     channels = body.columns(T, "velocity", "rates", "quaternion", "acceleration")
     f = np.stack([channels[name] for name in ("ax", "ay", "az")], axis=-1)
@@ -71,7 +71,7 @@ def test_a_velocity_measured_elsewhere_is_moved_to_the_origin():
 
 
 def test_a_velocity_through_moving_water_becomes_one_over_ground():
-    """Where the header knows the current; else nu stays relative to the water."""
+    """This needs the current in the header; otherwise nu stays relative to the water."""
     body = MovingBody(5)
     current = np.array([0.3, -0.2, 0.0])
     channels = body.columns(T, "velocity", "rates", "quaternion")
@@ -86,7 +86,7 @@ def test_a_velocity_through_moving_water_becomes_one_over_ground():
 @pytest.mark.parametrize("turns", [False, True])
 @pytest.mark.parametrize("form", ["quaternion", "euler"])
 def test_rates_come_from_the_attitude_where_there_is_no_gyro(form, turns):
-    """Also through a full roll, where Euler angles jump."""
+    """This holds also through a full roll, where Euler angles jump."""
     body = MovingBody(6, turns=turns)
     m = motion(trial(body.columns(T, form)), VEHICLE)
     assert m.nu_source == ("", "", "", *("derived from attitude",) * 3)
@@ -97,7 +97,8 @@ def test_rates_come_from_the_attitude_where_there_is_no_gyro(form, turns):
 
 @pytest.mark.parametrize("height", ["position", "depth"])
 def test_velocities_come_from_position_where_none_is_measured(height):
-    """Of a marker away from the origin, with the height from the position or from a pressure sensor elsewhere."""
+    """A marker away from the origin gives position, with the height from it or from a pressure sensor
+    elsewhere."""
     body = MovingBody(7)
     port = (-0.1, 0.05, -0.2)
     channels = body.columns(T, "quaternion") | body.columns(T, "position", at=POINT)
@@ -121,7 +122,7 @@ def test_heave_comes_from_depth_beside_a_measured_surge():
 
 
 def test_a_level_vehicle_needs_only_its_heading():
-    """Overhead camera: x, y and yaw give surge, sway and yaw rate; roll and pitch stay unknown, and so does heave."""
+    """With an overhead camera x, y and yaw give surge, sway and yaw rate; roll, pitch and heave stay unknown."""
     body = MovingBody(9)
     body.sizes[2:5] = 0.0
     channels = body.columns(T, "position", "euler")
@@ -133,7 +134,8 @@ def test_a_level_vehicle_needs_only_its_heading():
 
 
 def test_what_nothing_tells_stays_unknown():
-    """A gyro alone gives rates and nothing else; half a tilt is no attitude; a position without heading no velocity."""
+    """A gyro alone gives only rates, half a tilt gives no attitude, and a position without heading no
+    velocity."""
     body = MovingBody(10)
     gyro = motion(trial(body.columns(T, "rates")), VEHICLE)
     assert gyro.nu_source == ("", "", "", "measured", "measured", "measured")
@@ -145,7 +147,7 @@ def test_what_nothing_tells_stays_unknown():
 
 
 def test_a_tilt_without_heading_is_a_tilt():
-    """Roll and pitch from an inertial sensor, with a heading of 0."""
+    """Roll and pitch come from an inertial sensor, with a heading of 0."""
     body = MovingBody(11)
     channels = body.columns(T, "velocity", "rates", "euler")
     del channels["yaw"]
@@ -156,7 +158,7 @@ def test_a_tilt_without_heading_is_a_tilt():
 
 
 def test_streams_of_different_rates_and_jitter_come_onto_one_grid():
-    """Velocity at 8 Hz, gyro at 100 Hz, depth at 20 Hz, attitude at 50 Hz, none of them regular."""
+    """Velocity at 8 Hz, gyro at 100 Hz, depth at 20 Hz and attitude at 50 Hz, all with jitter."""
     body = MovingBody(12, fastest=1.5)
     rng = np.random.default_rng(0)
     streams = {}
@@ -172,7 +174,7 @@ def test_streams_of_different_rates_and_jitter_come_onto_one_grid():
 
 
 def test_five_hertz_of_wrench_and_velocity():
-    """The poorest usable log: six velocities and a wrench at 5 Hz."""
+    """The poorest usable log has six velocities and a wrench at 5 Hz."""
     body = MovingBody(13, fastest=1.5)
     t = np.arange(75) * 0.2
     channels = body.columns(t, "velocity", "rates") | {"tau_x": np.sin(t)}
@@ -184,7 +186,7 @@ def test_five_hertz_of_wrench_and_velocity():
 
 
 def test_a_gap_is_left_open_and_is_not_valid():
-    """Two seconds without velocity: unknown there, as good as ever on both sides."""
+    """Velocity is unknown for two seconds, and as accurate as elsewhere on both sides."""
     body = MovingBody(14)
     channels = body.columns(T, "velocity", "rates")
     hole = (T > 4.0) & (T < 6.0)
@@ -197,7 +199,7 @@ def test_a_gap_is_left_open_and_is_not_valid():
 
 
 def test_noise_is_estimated_by_axis():
-    """White noise of a different size on every axis is found within a tenth or so."""
+    """White noise of a different size on every axis is estimated to about a tenth."""
     body = MovingBody(15)
     rng = np.random.default_rng(0)
     sizes = np.array([0.01, 0.03, 0.002, 0.05, 0.005, 0.02])
@@ -212,7 +214,8 @@ def test_noise_is_estimated_by_axis():
 
 
 def test_phases_and_the_wrench_ride_along():
-    """Phases hold from their row on; the wrench is about the body origin; outside the inputs nothing is valid."""
+    """Phases hold from their row on; the wrench is about the body origin; rows outside the inputs are
+    invalid."""
     body = MovingBody(16)
     channels = body.columns(T, "velocity") | {"tau_z": np.where(T < 8.0, 2.0, np.nan)}
     made = trial(channels, passive=False, wrench_at=(0.5, 0.0, 0.0))
@@ -227,7 +230,8 @@ def test_phases_and_the_wrench_ride_along():
 
 @pytest.mark.parametrize("bias", [(0.0, 0.0, 0.0), (0.005, -0.003, 0.008)])
 def test_the_bias_of_a_gyroscope_is_its_difference_from_the_attitude(bias):
-    """To 0.3 mrad/s beside noise of both; 0 where noise explains the difference, and without a measured attitude."""
+    """It is right to 0.3 mrad/s with noise on both; 0 if noise explains the difference or no attitude was
+    measured."""
     rng, t = np.random.default_rng(3), np.arange(3000) * 0.02
     body = MovingBody(4)
     columns = body.columns(t, "rates", "quaternion")

@@ -1,4 +1,4 @@
-"""The significance of a relation between two signals holds for noise that is correlated in time."""
+"""The significance of a relation between two signals is valid for noise that is correlated in time."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from finssim.trials.significance import relation
 
 
 def coloured(rng, n, lag):
-    """Noise of unit size with a correlation time of `lag` samples."""
+    """Return noise of unit size with a correlation time of `lag` samples."""
     return lfilter([np.sqrt(2.0 / lag)], [1.0, 1.0 / lag - 1.0], rng.standard_normal(n + 20 * lag))[
         20 * lag :
     ]
@@ -16,7 +16,7 @@ def coloured(rng, n, lag):
 
 @pytest.mark.parametrize("lag", [1, 5, 25])
 def test_unrelated_noise_gives_the_stated_chance(lag):
-    """Of 400 pairs of 500 samples 20 have a chance below 5 %, both sides counted 40; hardly any is sure."""
+    """Of 400 pairs of 500 samples, 20 are below 5 % on one side, 40 on both; hardly any is certain."""
     rng = np.random.default_rng(lag)
     found = [relation(coloured(rng, 500, lag), coloured(rng, 500, lag)) for _ in range(400)]
     assert 15 <= sum(one.chance < 0.05 for one in found) <= 75
@@ -24,7 +24,7 @@ def test_unrelated_noise_gives_the_stated_chance(lag):
 
 
 def test_a_signal_and_its_negative_are_told_apart_beside_noise():
-    """Slope -1 in noise of half the signal's size, with a constant that neither has to explain."""
+    """The slope is -1 in noise of half the signal's size, with a constant that is not part of the relation."""
     rng = np.random.default_rng(0)
     t = np.arange(500) / 25.0
     x = np.sin(0.7 * t)
@@ -33,7 +33,7 @@ def test_a_signal_and_its_negative_are_told_apart_beside_noise():
 
 
 def test_gaps_and_empty_signals_say_nothing_of_themselves():
-    """Samples that are unknown do not count; a signal without samples has no relation."""
+    """Unknown samples do not count; a signal without samples has no relation."""
     x = np.sin(np.arange(300.0))
     y = np.where(np.arange(300) % 7 == 0, np.nan, 2.0 * x)
     assert relation(x, y).slope == pytest.approx(2.0) and relation(x, y).sure

@@ -1,4 +1,4 @@
-"""Smoothing: exact where there is nothing to smooth, as good as its own error bars where there is."""
+"""Smoothing is exact on noise-free signals, and otherwise as accurate as its own error bars."""
 
 import numpy as np
 import pytest
@@ -7,14 +7,14 @@ from finssim.trials.motion import longest_step, smooth, stretches, without_spike
 
 
 def times(rate, seconds=15.0, jitter=0.2, seed=0):
-    """Sample times that jitter by a part of their step."""
+    """Return sample times that jitter by a fraction of their step."""
     rng = np.random.default_rng(seed)
     n = int(seconds * rate)
     return (np.arange(n) + jitter * rng.uniform(-1.0, 1.0, n)) / rate
 
 
 def surge(t, time_constant=0.7):
-    """Velocity and acceleration of a vehicle that is pushed from 1 s to 10 s: two kinks."""
+    """Return velocity and acceleration of a vehicle that is pushed from 1 s to 10 s: two kinks."""
     up = 1.0 - np.exp(-np.maximum(t - 1.0, 0.0) / time_constant)
     top = 1.0 - np.exp(-9.0 / time_constant)
     down = top * np.exp(-np.maximum(t - 10.0, 0.0) / time_constant)
@@ -25,7 +25,7 @@ def surge(t, time_constant=0.7):
 
 @pytest.mark.parametrize("order", [2, 3])
 def test_polynomials_of_the_order_pass_unchanged(order):
-    """The penalty does not see polynomials below its order: value and slope come back."""
+    """The penalty is zero for polynomials below its order: value and slope are unchanged."""
     t = times(20.0)
     at = np.linspace(0.5, 14.0, 77)
     c = [0.3, -0.2, 0.05][:order]
@@ -36,11 +36,13 @@ def test_polynomials_of_the_order_pass_unchanged(order):
 
 @pytest.mark.parametrize("rate", [5.0, 20.0, 100.0])
 def test_a_sine_without_noise_and_its_slope(rate):
-    """sin and cos at 1.5 rad/s, from 5 Hz on, away from the ends."""
+    """sin and cos at 1.5 rad/s are recovered from 5 Hz on, away from the ends."""
     t = times(rate)
     at = np.linspace(1.0, 13.0, 301)
     s = smooth(t, np.sin(1.5 * t)[:, None], at, order=3)
-    h = 1.5 / rate  # the cubic spline's error: h⁴ in the value and h³ in the slope, with room for the jitter
+    h = (
+        1.5 / rate
+    )  # error of the cubic spline: h⁴ in the value and h³ in the slope, with margin for the jitter
     np.testing.assert_allclose(s.value[:, 0], np.sin(1.5 * at), atol=0.2 * h**3 + 1e-6)
     np.testing.assert_allclose(s.slope[:, 0], 1.5 * np.cos(1.5 * at), atol=0.6 * h**2 + 1e-5)
 
@@ -48,7 +50,7 @@ def test_a_sine_without_noise_and_its_slope(rate):
 @pytest.mark.parametrize("rate", [5.0, 20.0, 50.0, 100.0])
 @pytest.mark.parametrize("noise", [0.003, 0.01, 0.03])
 def test_the_strength_follows_the_noise(rate, noise):
-    """Noise is estimated from the data, and the slope is wrong by about what is claimed."""
+    """Noise is estimated from the data, and the slope's error is about as large as stated."""
     at = np.linspace(0.5, 14.0, 500)
     v, a = surge(at)
     errors, found = [], []
@@ -67,7 +69,7 @@ def test_the_strength_follows_the_noise(rate, noise):
 
 
 def test_smoothing_makes_no_delay():
-    """Reversing time reverses the result: zero phase."""
+    """Reversing time reverses the result, so the phase is zero."""
     t = np.arange(300) * 0.02
     y = surge(t * 2.0)[0] + 0.02 * np.random.default_rng(0).normal(size=300)
     forward = smooth(t, y[:, None], t)
@@ -77,7 +79,7 @@ def test_smoothing_makes_no_delay():
 
 
 def test_nothing_is_said_inside_a_gap_or_beyond_the_ends():
-    """NaN where no samples reach, and each side is as if the other did not exist."""
+    """Values without samples nearby are NaN, and each side of a gap is smoothed independently."""
     t = np.concatenate([np.arange(100), np.arange(150, 250)]) * 0.02
     y = np.where(t < 2.5, np.sin(t), 5.0 + np.cos(t))
     at = np.arange(-10, 260) * 0.02
@@ -91,7 +93,7 @@ def test_nothing_is_said_inside_a_gap_or_beyond_the_ends():
 
 
 def test_a_gap_is_judged_by_the_usual_step():
-    """0.2 s at high rates, four steps at low ones; runs too short for a curve are left out."""
+    """The limit is 0.2 s at high rates, four steps at low ones; runs too short for a curve are dropped."""
     assert longest_step(np.arange(50) * 0.01) == pytest.approx(0.2)
     assert longest_step(np.arange(50) * 0.2) == pytest.approx(0.8)
     assert [(s.start, s.stop) for s in stretches(np.array([0.0, 0.1, 0.9, 1.0, 1.1]), 0.2)] == [
@@ -103,7 +105,7 @@ def test_a_gap_is_judged_by_the_usual_step():
 
 
 def test_spikes_are_left_out_and_steps_are_not():
-    """A wild sample is refused; a jump to a new level, noise and a silent signal are kept."""
+    """A spike is dropped; a jump to a new level, noise and a constant signal are kept."""
     rng = np.random.default_rng(0)
     t = np.arange(400) * 0.02
     y = surge(t * 2.0)[0] + 0.01 * rng.normal(size=400)
@@ -119,7 +121,7 @@ def test_spikes_are_left_out_and_steps_are_not():
 @pytest.mark.parametrize("order", [2, 3])
 @pytest.mark.parametrize("kind", ["zero", "constant", "line", "noise"])
 def test_signals_without_shape_come_out_flat_and_straight(n, order, kind):
-    """However long and however strongly smoothed: no rounding grows, and noise is flat over windows of 4 s."""
+    """For any length and strength no rounding error grows, and noise is flat over windows of 4 s."""
     t = np.arange(n) * 0.01
     rng = np.random.default_rng(0)
     y = {"zero": 0.0 * t, "constant": 0.0 * t - 3.0, "line": 0.7 * t + 2.0, "noise": rng.normal(size=n)}[kind]
@@ -132,7 +134,7 @@ def test_signals_without_shape_come_out_flat_and_straight(n, order, kind):
 
 
 def test_a_burst_is_followed_and_the_calm_after_it_is_smooth():
-    """Three seconds of handling at 2 Hz, then a slow drift: each is smoothed as if alone."""
+    """Three seconds of handling at 2 Hz and a slow drift afterwards are each smoothed as if alone."""
     t = np.arange(2000) * 0.01
     burst = np.where(t < 3.0, 0.3 * np.sin(12.0 * t), 0.0)
     y = burst + 0.05 * np.sin(0.3 * t) + 0.01 * np.random.default_rng(0).normal(size=2000)

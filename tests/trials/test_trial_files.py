@@ -1,4 +1,4 @@
-"""Trials on disk: round trips, repairs that are told, refusals that say where."""
+"""Trials on disk: round trips, reported repairs, and refusals with their location."""
 
 import math
 import time
@@ -16,7 +16,7 @@ COLUMNS = ("tau_x", "tau_n", "u", "v", "w", "p", "q", "r", "ax", "ay", "az", "x"
 
 
 def a_trial(seed=0, n=50, **changes):
-    """Random numbers in many columns, one of them at a fifth of the rate, with unit quaternions."""
+    """Return random numbers in many columns, one of them at a fifth of the rate, with unit quaternions."""
     rng = np.random.default_rng(seed)
     q = np.array([0.0, 0.0, 0.0, 1.0]) + 0.2 * rng.normal(size=(n, 4))
     q /= np.linalg.norm(q, axis=1, keepdims=True)
@@ -33,7 +33,7 @@ def a_trial(seed=0, n=50, **changes):
 
 
 def csv(folder: Path, text: str, header: str | None = None) -> Path:
-    """A trial folder with this table and header."""
+    """Write a trial folder with this table and header."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "data.csv").write_bytes(text.encode())
     if header is not None:
@@ -42,7 +42,7 @@ def csv(folder: Path, text: str, header: str | None = None) -> Path:
 
 
 def rows(n=20, step=0.1, start=0.0):
-    """Lines of t and u = sin t."""
+    """Return lines of t and u = sin t."""
     t = start + step * np.arange(n)
     return "".join(f"{x!r},{math.sin(x)!r}\n" for x in t.tolist())
 
@@ -53,7 +53,7 @@ def rows(n=20, step=0.1, start=0.0):
 @pytest.mark.parametrize("format", ["csv", "parquet"])
 @pytest.mark.parametrize("seed", range(3))
 def test_a_written_trial_reads_back_bit_for_bit(tmp_path, format, seed):
-    """What was written is read: numbers, gaps, phases, header and hash."""
+    """Numbers, gaps, phases, header and hash are identical."""
     header = Header(
         vehicle="finsrov",
         velocity_at=(0.1, 0.0, 1e-5),
@@ -73,7 +73,7 @@ def test_a_written_trial_reads_back_bit_for_bit(tmp_path, format, seed):
 
 
 def test_the_hash_is_of_the_meaning_not_of_the_place(tmp_path):
-    """Name, folder, format and role leave the hash; a number, a phase or what a number means change it."""
+    """Name, folder, format and role do not affect the hash; a number, a phase or the meaning of a number do."""
     trial = a_trial()
     write_trial(trial, tmp_path / "a", format="csv")
     write_trial(a_trial(header=Header(role="held-out", description="x")), tmp_path / "b", format="parquet")
@@ -85,7 +85,7 @@ def test_the_hash_is_of_the_meaning_not_of_the_place(tmp_path):
 
 
 def test_an_earlier_trial_is_replaced_and_other_files_are_not(tmp_path):
-    """Writing again replaces our own output as a whole; a folder with somebody's notes in it is refused."""
+    """Writing again replaces our own output as a whole; a folder with other files in it is refused."""
     write_trial(a_trial(0), tmp_path / "made", format="parquet")
     write_trial(a_trial(1), tmp_path / "made")
     assert sorted(file.name for file in (tmp_path / "made").iterdir()) == ["data.csv", "trial.yaml"]
@@ -97,7 +97,7 @@ def test_an_earlier_trial_is_replaced_and_other_files_are_not(tmp_path):
 
 @pytest.mark.slow
 def test_thirty_two_trials_load_in_less_than_a_second(tmp_path):
-    """15 s at 50 Hz and 20 columns, 32 times, as the calibration of a vehicle reads them."""
+    """Each has 15 s at 50 Hz and 20 columns, as in the calibration of a vehicle."""
     for seed in range(32):
         write_trial(a_trial(seed, n=750), tmp_path / f"trial{seed}")
     best = np.inf
@@ -112,7 +112,7 @@ def test_thirty_two_trials_load_in_less_than_a_second(tmp_path):
 
 
 def test_a_folder_of_trials_is_read_in_natural_order(tmp_path):
-    """Trial 2 comes before trial 10, bare tables count, and names are unique."""
+    """Trial 2 comes before trial 10, tables without a folder count, and names are unique."""
     for i in (10, 2, 1):
         csv(tmp_path / f"run{i}", "t,u\n" + rows(20 + i))
     (tmp_path / "bare.csv").write_text("t,u\n" + rows(50))
@@ -123,7 +123,7 @@ def test_a_folder_of_trials_is_read_in_natural_order(tmp_path):
 
 
 def test_the_same_trial_twice_is_refused(tmp_path):
-    """Equal numbers would count as two measurements."""
+    """Otherwise equal numbers would count as two measurements."""
     csv(tmp_path / "a", "t,u\n" + rows())
     csv(tmp_path / "b", "t,u\n" + rows(), "description: a copy")
     with pytest.raises(CalibrationError, match=r"b: contains the same numbers as .*a: .* omit one of them"):
@@ -135,7 +135,7 @@ def test_the_same_trial_twice_is_refused(tmp_path):
 
 @pytest.mark.parametrize("cut", range(1, 40))
 def test_a_cut_off_file_opens_up_to_the_cut(tmp_path, cut):
-    """However many bytes a crash took, no number appears that was not logged."""
+    """However many bytes are missing, only logged numbers appear."""
     text = "t,u,w\n" + "".join(f"{i / 10!r},{math.sin(i)!r},{math.cos(i) * 1e-5!r}\n" for i in range(20))
     trial = load_trial(csv(tmp_path / "cut", text[:-cut]))
     i = np.rint(trial.t * 10.0)
@@ -144,17 +144,17 @@ def test_a_cut_off_file_opens_up_to_the_cut(tmp_path, cut):
         good = np.isfinite(trial.channels[name])
         assert good.sum() >= 18
         np.testing.assert_array_equal(trial.channels[name][good], np.array(truth)[good])
-    assert trial.findings or text[-cut - 1] == ","  # an empty last cell looks whole
+    assert trial.findings or text[-cut - 1] == ","  # an empty last cell looks complete
 
 
 def test_zero_bytes_after_a_crash_are_the_end(tmp_path):
-    """A file system leaves zeros where it had made room."""
+    """A file system leaves zeros in preallocated space."""
     trial = load_trial(csv(tmp_path / "cut", "t,u\n" + rows() + "\0" * 300))
     assert len(trial.t) == 20 and trial.findings[0].code == "zero_bytes"
 
 
 def test_late_rows_are_sorted_and_repeated_times_merged(tmp_path):
-    """Rows that came a little late are put in their place; rows of one time complete each other."""
+    """Slightly late rows are sorted; rows of one time complete each other."""
     text = "t,u,w\n0,1,\n0.1,2,\n0.3,4,\n0.2,3,\n0.3,,7\n0.4,5,8\n"
     trial = load_trial(csv(tmp_path / "late", text))
     np.testing.assert_array_equal(trial.t, [0.0, 0.1, 0.2, 0.3, 0.4])
@@ -164,7 +164,7 @@ def test_late_rows_are_sorted_and_repeated_times_merged(tmp_path):
 
 
 def test_the_newest_row_may_be_first(tmp_path):
-    """A log written backwards is the same trial; a shuffled one is refused, for nobody knows what happened to it."""
+    """A log in reverse order is the same trial; a shuffled one is refused, because the cause is unknown."""
     lines = rows(60).splitlines()
     straight = load_trial(csv(tmp_path / "a", "\n".join(["t,u", *lines, ""])))
     again = load_trial(csv(tmp_path / "b", "\n".join(["t,u", *lines[::-1], ""])))
@@ -175,7 +175,7 @@ def test_the_newest_row_may_be_first(tmp_path):
 
 
 def test_a_clock_that_jumps_back_leaves_a_gap_between_two_pieces(tmp_path):
-    """The rows after the jump are not laid between those before it: that would mix two moments."""
+    """Rows after the jump are not sorted between earlier ones, which would mix two moments."""
     text = "t,u\n" + rows(50) + "".join(f"{2.0 + 0.1 * i!r},{100 + i}\n" for i in range(40))
     trial = load_trial(csv(tmp_path / "jump", text))
     np.testing.assert_array_equal(trial.channels["u"][50:], 100.0 + np.arange(40))
@@ -209,7 +209,7 @@ def test_times_since_1970_begin_at_zero(tmp_path):
 
 
 def test_what_is_no_number_counts_as_empty_and_is_told(tmp_path):
-    """Empty cells and words for nothing are silent; text and infinities are told with their row."""
+    """Empty cells and words for missing values are silent; text and infinities are reported with their row."""
     text = "t,u,w\n0,1,2\n0.1,,nan\n0.2,NaN,null\n0.3,inf,ERR\n0.4,5,6\n"
     trial = load_trial(csv(tmp_path / "dirty", text))
     for name in "uw":
@@ -221,7 +221,7 @@ def test_what_is_no_number_counts_as_empty_and_is_told(tmp_path):
 
 @pytest.mark.parametrize("separator", [";", "\t"])
 def test_other_separators_and_decimal_commas_are_read(tmp_path, separator):
-    """Spreadsheets of half of Europe."""
+    """Spreadsheets in many European countries use them."""
     text = "\ufeff# exported\nt,u\n".replace(",", separator) + f"0,0{separator}1,5\n0,1{separator}2,5\n"
     trial = load_trial(csv(tmp_path / "comma", text))
     np.testing.assert_array_equal(trial.t, [0.0, 0.1])
@@ -229,7 +229,7 @@ def test_other_separators_and_decimal_commas_are_read(tmp_path, separator):
 
 
 def test_unknown_columns_and_phases_are_left_out_with_a_guess(tmp_path):
-    """A foreign column costs nothing; a misspelt one gets a hint."""
+    """A foreign column is ignored; a misspelt one gets a hint."""
     trial = load_trial(csv(tmp_path / "x", "t,u,depht,phase\n0,1,2,excite\n1,2,3,Coast\n"))
     assert set(trial.channels) == {"u"} and trial.phase.tolist() == ["", "coast"]
     hints = {
@@ -242,7 +242,7 @@ def test_unknown_columns_and_phases_are_left_out_with_a_guess(tmp_path):
 
 
 def test_quaternions_get_unit_length_and_one_sign(tmp_path):
-    """q and -q are one attitude; zeros are no attitude."""
+    """q and -q are the same attitude; zeros are not an attitude."""
     text = "t,qx,qy,qz,qw\n0,0,0,0.2,2\n1,0,0,-0.1,-1\n2,0,0,0,0\n3,0,0,-0.1,-1\n"
     trial = load_trial(csv(tmp_path / "q", text))
     q = np.stack([trial.channels[f"q{c}"] for c in "xyzw"], axis=-1)
@@ -274,7 +274,7 @@ def test_quaternions_get_unit_length_and_one_sign(tmp_path):
     ],
 )
 def test_a_table_that_is_no_trial_is_refused_with_the_reason(tmp_path, text, said):
-    """One sentence that names the file and says what was expected."""
+    """The refusal is one sentence that names the file and what was expected."""
     with pytest.raises(CalibrationError, match=said) as error:
         load_trial(csv(tmp_path / "bad", text))
     assert "data.csv" in str(error.value) and "\n" not in str(error.value)
@@ -301,7 +301,7 @@ def test_a_header_that_is_wrong_is_refused_with_the_reason(tmp_path, header, sai
 
 
 def test_places_without_a_trial_are_refused(tmp_path):
-    """Nothing there, nothing in it, two tables, and files of other kinds."""
+    """A missing or empty folder, two tables, and files of other kinds are refused."""
     for path, said in [
         (tmp_path / "none", "no such file"),
         (tmp_path, "contains no trial|neither"),
@@ -321,7 +321,7 @@ def test_places_without_a_trial_are_refused(tmp_path):
 
 
 def test_the_header_on_the_page_is_read(tmp_path):
-    """The example of the trial format's page, with a log that it fits."""
+    """The example on the page of the trial format is read with a matching log."""
     page = (Path(__file__).resolve().parents[2] / "docs" / "reference" / "trial_format.md").read_text("utf-8")
     example = page.split("```yaml\n")[1].split("```")[0]
     trial = load_trial(csv(tmp_path / "x", "t,u,v\n0,1,2\n1,1,2\n", example))
@@ -330,7 +330,7 @@ def test_the_header_on_the_page_is_read(tmp_path):
 
 
 def test_any_damage_gives_a_trial_or_one_sentence(tmp_path):
-    """Bytes flipped, cut and doubled at random: what is read has increasing times and finite or empty numbers."""
+    """With bytes flipped, cut and doubled at random, times increase and numbers are finite or empty."""
     rng = np.random.default_rng(0)
     names = [
         "t",

@@ -1,4 +1,4 @@
-"""A small invented vehicle file that tests copy and spoil."""
+"""A small invented vehicle file that tests copy and modify."""
 
 MINNOW = """\
 title: Minnow

@@ -1,4 +1,4 @@
-"""What the thrusters can do, against the published table and closed forms."""
+"""Capability of the thrusters, against the published table and closed forms."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_wrench_limits_are_the_published_symmetric_ones_in_policy_order():
 
 @EVERY
 def test_no_sampled_thrust_beats_the_capability(name):
-    """Duality: some f within limits reaches each bound, and scaling pure wrenches of random f never passes it."""
+    """Duality: some f within limits reaches each bound, and the pure wrench of a random f never exceeds it."""
     vehicle = load_vehicle(name)
     capability = wrench_capability(vehicle)
     rows = [AXES.index(axis) for axis in vehicle.controlled_axes]
@@ -111,7 +111,7 @@ def test_finsrov_without_angular_added_mass_swings_as_published():
 
 @EVERY
 def test_trim_thrust_balances_weight_and_buoyancy(name):
-    """Thrust, weight and buoyancy add up to nothing on the controlled axes, about any point."""
+    """Thrust, weight and buoyancy sum to zero on the controlled axes, about any point."""
     vehicle = load_vehicle(name)
     level = trim(vehicle)
     assert level.forces is not None
@@ -123,7 +123,7 @@ def test_trim_thrust_balances_weight_and_buoyancy(name):
 
 
 def test_trim_holds_an_offset_centre_of_buoyancy():
-    """Buoyancy 0.01 m ahead lifts the nose (a negative pitch moment); trim pushes the nose down."""
+    """Buoyancy 0.01 m ahead lifts the nose (a negative pitch moment), so trim pushes the nose down."""
     vehicle = load_vehicle("finsrov").replace({"body.center_of_buoyancy": [0.01, 0.0, 0.03]})
     assert trim(vehicle).wrench[4] == pytest.approx(0.01 * vehicle.buoyancy)
 

@@ -1,4 +1,4 @@
-"""The catalogue carries the published numbers, converted into our frames."""
+"""The catalogue contains the published numbers, converted to FinsSim's frames."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from finssim.vehicles.capability import terminal_speeds
 from reference.fossen import F, Torpedo
 from reference.remus import Remus
 
-FLIP = np.array([1.0, -1.0, -1.0])  # NED body axes (x forward, y right, z down) to ours
+FLIP = np.array([1.0, -1.0, -1.0])  # NED body axes (x forward, y right, z down) to FinsSim's
 FLIP6 = np.diag([1.0, -1.0, -1.0, 1.0, -1.0, -1.0])
 RAD_PER_RPM = math.pi / 30.0
 
 
 def published_B() -> np.ndarray:
-    """FinsROV's allocation matrix as printed, in its controller frame: x forward, y up, z left (left-handed).
+    """Return FinsROV's allocation matrix as printed, in its controller frame: x forward, y up, z left (left-handed).
 
-    Rows Fx Fy Fz Mx My Mz, columns in canonical order.
+    Rows are Fx Fy Fz Mx My Mz, columns in canonical order.
     """
     return np.array(
         [
@@ -37,7 +37,8 @@ def published_B() -> np.ndarray:
 
 
 def controller_frame(B: np.ndarray) -> np.ndarray:
-    """Ours to the controller frame: forces exchange y and z, moments too and change sign (axial vectors)."""
+    """Convert to the controller frame: forces exchange y and z; moments do too and change sign (axial
+    vectors)."""
     return np.vstack([B[[0, 2, 1]], -B[[3, 5, 4]]])
 
 
@@ -132,9 +133,9 @@ def test_finsrov_roll_and_pitch_are_told_to_be_placeholders(key, axis):
 
 
 def test_bluerov2_heavy_thrusters_are_the_published_ned_ones():
-    """Rows of the published matrix in NED, turned: axes point where ArduSub's positive output pushes, against it.
+    """Rows of the published NED matrix, rotated, agree; axes point where ArduSub's positive output pushes, against it.
 
-    The horizontal thrusters are as high as in CentraleNantes's model: 0.0725 m instead of 0.085 m.
+    The horizontal thrusters are at the height of CentraleNantes's model: 0.0725 m instead of 0.085 m.
     """
     vehicle = load_vehicle("bluerov2_heavy")
     s = math.sqrt(0.5)
@@ -212,7 +213,8 @@ TORPEDO = Torpedo()
 
 
 def test_torpedo_has_the_masses_of_pythonvehiclesimulator():
-    """Mass matrix, linear damping but that of surge and sway, and restoring arm, by its formulas of a spheroid."""
+    """Mass matrix, linear damping except surge and sway, and restoring arm follow its formulas for a
+    spheroid."""
     vehicle = load_vehicle("torpedo")
     M = np.outer(F, F) * (TORPEDO.M_RB + TORPEDO.M_A)
     np.testing.assert_allclose(vehicle.mass_matrix(), M, rtol=1e-7, atol=1e-9)
@@ -222,9 +224,9 @@ def test_torpedo_has_the_masses_of_pythonvehiclesimulator():
 
 
 def test_torpedo_has_the_drag_and_propeller_of_pythonvehiclesimulator():
-    """By `acceleration` at 2.5 m/s ahead, and with sway and heave: forces on hull, fins and propeller within 1.5 %.
+    """By `acceleration` at 2.5 m/s ahead, also with sway and heave, hull, fins and propeller agree within 1.5 %.
 
-    In roll within 6 %: while it turns, each of our fins has its own speed.
+    Roll agrees within 6 %, because in a turn each of our fins has its own speed.
     """
     vehicle, remus = load_vehicle("torpedo"), Remus(fin_drag=False)
     nu = np.array(
@@ -242,7 +244,8 @@ def test_torpedo_has_the_drag_and_propeller_of_pythonvehiclesimulator():
 
 @pytest.mark.parametrize(("name", "robot"), [("lauv", "lauv_gazebo"), ("eca_a9", "eca_a9")])
 def test_fins_of_uuv_simulator_turn_and_dive_as_there(name, robot):
-    """Fins that turn with equal sign about outward axes roll; upper and lower with opposite sign yaw, and so on."""
+    """Fins turned equally about outward axes roll the vehicle; upper and lower with opposite sign yaw it, and
+    so on."""
     vehicle = load_vehicle(name)
     fins = list(vehicle.actuators.values())
     state = ([0.0, 0.0, -50.0, 0.0, 0.0, 0.0], [1.5, 0.0, 0.0, 0.0, 0.0, 0.0])
@@ -272,7 +275,7 @@ def test_fins_of_uuv_simulator_turn_and_dive_as_there(name, robot):
     ],
 )
 def test_bluerov2_sets_answer_a_push_as_the_survey_of_them_says(name, m_eff, speeds, yaw_rate):
-    """Steady response to 50 N on each axis and 5 N m of yaw, to the printed digits."""
+    """The steady response to 50 N on each axis and 5 N m of yaw agrees to the printed digits."""
     from finssim.vehicles.capability import terminal_speed
 
     vehicle = load_vehicle(name)
@@ -287,7 +290,7 @@ def test_bluerov2_sets_answer_a_push_as_the_survey_of_them_says(name, m_eff, spe
 
 
 def test_bluerov2_heavy_floats_as_its_manufacturer_trims_it():
-    """0.2 kg of net buoyancy; the set with an arm keeps the height of thrusters that it was identified with."""
+    """Net buoyancy is 0.2 kg; the set with an arm keeps the thruster height with which it was identified."""
     vehicle = load_vehicle("bluerov2_heavy")
     assert (vehicle.buoyancy - vehicle.weight) / vehicle.water.gravity == pytest.approx(0.2, abs=1e-6)
     assert load_vehicle("bluerov2_heavy_morgan").thrusters["T1"].position[2] == -0.085
@@ -298,7 +301,7 @@ PUBLISHED = yaml.safe_load(check.PUBLISHED.read_text())
 
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_top_speed_and_pull_are_near_the_published_ones_or_have_a_reason(name):
-    """d1 v + d2 v² = thrust; a difference of more than a fifth has a reason, and a reason has a difference."""
+    """d1 v + d2 v² = thrust; exactly the differences of more than a fifth have a stated reason."""
     vehicle, row = load_vehicle(name), PUBLISHED[name]
     chosen = vehicle.hydrodynamics["calibrated"]
     d1, d2 = chosen.linear_damping[0, 0], chosen.axis_drag[0]
@@ -326,7 +329,7 @@ def test_top_speed_and_pull_are_near_the_published_ones_or_have_a_reason(name):
 
 
 def test_a_top_speed_far_from_the_published_one_is_reported(monkeypatch):
-    """Without a reason; and a vehicle without a row has no published one."""
+    """It is reported if it has no reason; a vehicle without a row has no published speed."""
     monkeypatch.setattr(
         check, "read_mapping", lambda *_, **__: {"remus100": {"top_speed": 1.5, "source": "x"}}
     )

@@ -1,4 +1,4 @@
-"""The check passes what is sound and says what is not."""
+"""The vehicle check accepts sound files and names what is wrong in others."""
 
 from __future__ import annotations
 
@@ -84,7 +84,8 @@ def remark(vehicle: Vehicle) -> str | None:
 
 
 def test_sets_of_one_vehicle_that_disagree_are_remarked():
-    """bluerov2_heavy: drag as identified and that of its panels are a factor of 2.5 apart in surge, 1.4 in heave."""
+    """bluerov2_heavy: identified drag and that of its panels differ by a factor of 2.5 in surge, 1.4 in
+    heave."""
     heavy = load_vehicle("bluerov2_heavy")
     assert "127 N of surge give 'calibrated' 0.90, 'mesh' 2." in (remark(heavy) or "")
     assert "heave" not in (remark(heavy) or "")
@@ -95,7 +96,8 @@ def test_sets_of_one_vehicle_that_disagree_are_remarked():
 
 @pytest.mark.parametrize("name", ["finsrov", "rexrov"])
 def test_drag_of_panels_is_that_of_the_simulated_hull(name):
-    """M dν/dt of a submerged level vehicle, at 1 m/s less at rest, is -d2 along the axis, by either direction."""
+    """M dν/dt of a submerged level vehicle at 1 m/s, minus that at rest, is -d2 along the axis, in either
+    direction."""
     vehicle = load_vehicle(name)
     eta, M = [0.0, 0.0, -50.0, 0.0, 0.0, 0.0], vehicle.mass_matrix("mesh")
     rest = acceleration(vehicle, eta, np.zeros(6), hydrodynamics="mesh")

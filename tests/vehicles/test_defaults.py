@@ -1,4 +1,4 @@
-"""What stands for the sections that a vehicle file leaves out."""
+"""Defaults of the sections that a vehicle file omits."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from finssim.vehicles.show import print_vehicle
 
 @pytest.mark.parametrize("name", catalogue())
 def test_tags_lie_on_the_top_and_face_up(name):
-    """Two tags whose margins do not meet, on the envelope, printed side up."""
+    """Two tags with separate margins lie on the envelope, printed side up."""
     vehicle = load_vehicle(name)
     tags, half = vehicle.tags, 0.5 * vehicle.body.size
     first, second = (np.asarray(mount.position) for mount in tags.mounts.values())
@@ -39,7 +39,7 @@ def test_tags_lie_on_the_top_and_face_up(name):
     "name", [name for name in catalogue() if name not in ("eca_a9", "lauv", "remus100", "slocum", "torpedo")]
 )
 def test_every_vehicle_that_hovers_has_a_pool(name):
-    """A plant and a camera, a basin that the hull fits in, and a workspace as large as the basin."""
+    """It has a plant and a camera, a basin that fits the hull, and a workspace as large as the basin."""
     vehicle = load_vehicle(name)
     spec = draw_plant(vehicle, 1, "realistic")
     camera_of(vehicle, 1, "realistic")
@@ -53,13 +53,13 @@ def test_every_vehicle_that_hovers_has_a_pool(name):
 
 
 def test_the_published_vehicle_has_the_published_pool():
-    """FinsROV gives everything itself and keeps its pool of 4 m x 2 m x 1 m."""
+    """FinsROV's file defines everything, with its pool of 4 m x 2 m x 1 m."""
     vehicle = load_vehicle("finsrov")
     assert vehicle.defaults == ("perception",) and basin_of(vehicle) == Basin()
 
 
 def test_defaults_are_no_part_of_the_digest_or_the_file(tmp_path):
-    """A vehicle written to a file and read again has the same defaults and the same digest, and no section of them."""
+    """A vehicle written and read again has the same defaults and digest; its file has no default section."""
     vehicle = load_vehicle("rexrov")
     assert vehicle.defaults == tuple(DEFAULTS)
     write_vehicle(vehicle, tmp_path / "copy.yaml")
@@ -69,7 +69,7 @@ def test_defaults_are_no_part_of_the_digest_or_the_file(tmp_path):
 
 
 def test_one_number_of_a_default_can_be_changed():
-    """The rest of its section then stays what it was and belongs to the vehicle."""
+    """The rest of the section keeps its defaults and belongs to the vehicle."""
     vehicle = load_vehicle("bluerov2_heavy")
     changed = vehicle.replace({"safety.max_tilt": 0.5, "tags.edge": 0.05})
     assert changed.safety.max_tilt == 0.5 and changed.safety.command_rate == vehicle.safety.command_rate
@@ -78,14 +78,14 @@ def test_one_number_of_a_default_can_be_changed():
 
 
 def test_tags_can_be_taken_off(tmp_path):
-    """`tags: null` is a vehicle without, and a default is none that a real camera may look for."""
+    """`tags: null` gives a vehicle without tags, and a real camera may not look for default ones."""
     (tmp_path / "bare.yaml").write_text("extends: bluerov2\ntags: null\n", encoding="utf-8")
     assert load_vehicle(tmp_path / "bare.yaml").tags is None
     assert load_vehicle("bluerov2").file_tags is None
 
 
 def test_show_says_which_sections_are_defaults():
-    """Each with what stands for it, and only those."""
+    """Each is shown with its default, and no other section is."""
     for name, said in (("bluerov2_heavy", True), ("finsrov", False)):
         console = Console(record=True, width=200, file=io.StringIO())
         print_vehicle(load_vehicle(name), console)
@@ -94,7 +94,7 @@ def test_show_says_which_sections_are_defaults():
 
 
 def test_sensors_of_a_site_are_listed_once_a_file_gives_them(tmp_path):
-    """In place of the default's names; a sensor's own file lies beside the vehicle's and travels with it."""
+    """They replace the default's names; a sensor's own file lies beside the vehicle's and is copied with it."""
     device = "kind: range\nabout: a\nsource: s\nminimum_range: 0.1\nrange: 5.0\nrate: 4.0\n"
     (tmp_path / "short.yaml").write_text(device, encoding="utf-8")
     entry = (
@@ -125,7 +125,7 @@ def test_sensors_of_a_site_are_listed_once_a_file_gives_them(tmp_path):
     ],
 )
 def test_a_sensor_that_cannot_be_is_refused(tmp_path, entry, message):
-    """One sentence that names the entry."""
+    """The refusal is one sentence that names the entry."""
     text = f"extends: bluerov2\nperception:\n  origin: guessed\n  {entry}\n"
     (tmp_path / "mine.yaml").write_text(text, encoding="utf-8")
     with pytest.raises(VehicleError, match=message):

@@ -1,4 +1,4 @@
-"""Speed controllers: the law between pulse width, voltage and shaft speed, and what a vehicle file may say about it."""
+"""Speed controllers: the law between pulse width, voltage and shaft speed, and their keys in a vehicle file."""
 
 import numpy as np
 import pytest
@@ -38,7 +38,7 @@ def test_pulse_inverts_shaft_speed(omega, voltage):
 
 
 def test_the_dead_band_narrows_with_voltage_as_the_slowest_speed_stays():
-    """At 10 V to 20 V the manufacturer's table stands still up to ±40, 36, 32, 28, 28, 26 µs."""
+    """From 10 V to 20 V the manufacturer's table shows no motion up to ±40, 36, 32, 28, 28, 26 µs."""
     widths = [ESC.dead_band(volts)[1] - 1500.0 for volts in (10, 12, 14, 16, 18, 20)]
     np.testing.assert_allclose(widths, [40, 36, 32, 28, 28, 28], atol=4.0)  # the table steps by 4 µs
     assert ESC.shaft_speed([1470.5, 1529.5]).tolist() == [0.0, 0.0]
@@ -56,7 +56,7 @@ def test_pulses_broadcast_with_voltages_and_saturate():
 
 
 def test_reversed_wiring_mirrors_the_pulse():
-    """With motor_sign -1 small pulses are positive thrust, by the forward law; no signal still means off."""
+    """With motor_sign -1 short pulses give positive thrust, by the forward law; no signal still means off."""
     vehicle = load_vehicle("bluerov2")
     plain = vehicle.thrusters["T1"]
     turned = vehicle.replace({"thrusters.T1.motor_sign": -1, "autopilot.directions": [-1]}).thrusters["T1"]
@@ -93,7 +93,8 @@ def test_a_thruster_without_the_section_says_what_to_do():
 
 
 def test_a_group_gives_its_thrusters_their_speed_controller(tmp_path):
-    """`esc` may stand in `thruster_groups`; a vehicle without one keeps the digest it had before the key existed."""
+    """`esc` is allowed in `thruster_groups`; a vehicle without one keeps the digest from before the key
+    existed."""
     numbers = ", ".join(f"{key}: {value}" for key, value in NUMBERS.items())
     with_esc = MINNOW.replace("domain: speed,", f"domain: speed, esc: {{{numbers}}},")
     for name, text in (("plain", MINNOW), ("wired", with_esc)):

@@ -1,4 +1,4 @@
-"""Export for gz-sim: what its files hold comes back as the same numbers, and what they do not hold is named."""
+"""Exported gz-sim files import with the same numbers, and what they cannot represent is named."""
 
 import json
 from xml.etree import ElementTree
@@ -27,14 +27,14 @@ def returned(folder, vehicle, kind):
 
 
 def unreactive(vehicle):
-    """The vehicle without reaction torque, which gz-sim's plugin does not have."""
+    """Return the vehicle without reaction torque, which gz-sim's plugin does not have."""
     return vehicle.replace({"thrusters.*.torque_constant": 0.0})
 
 
 @pytest.mark.parametrize("kind", ["sdf", "urdf"])
 @pytest.mark.parametrize("name", COEFFICIENTS)
 def test_what_is_held_comes_back(tmp_path, name, kind):
-    """Body, water, added mass, damping and thrusters, about the reference point of the coefficients."""
+    """Body, water, added mass, damping and thrusters agree about the reference point of the coefficients."""
     vehicle, found = load_vehicle(name), returned(tmp_path, load_vehicle(name), kind)
     given, read = vehicle.hydrodynamics["calibrated"], found.hydrodynamics["calibrated"]
     point = given.reference_point
@@ -78,7 +78,7 @@ def test_signs_are_those_of_gz_sim(tmp_path):
 
 @pytest.mark.slow
 def test_a_model_of_gz_sim_returns_to_gz_sim(tmp_path):
-    """bluerov2_gz heavy, imported and exported, has gz-sim's terminal speeds in surge and sway with 20 N."""
+    """bluerov2_gz heavy, imported and exported, has gz-sim's terminal speeds in surge and sway at 20 N."""
     vehicle = read_foreign(write(tmp_path / "heavy.sdf", HEAVY)).vehicle(tmp_path)
     found = returned(tmp_path, vehicle, "sdf")
     assert found.mass_matrix() == pytest.approx(vehicle.mass_matrix(), abs=1e-9)
@@ -112,7 +112,8 @@ def test_the_command_lists_what_is_not_held(tmp_path, monkeypatch, capsys):
 
 @pytest.mark.parametrize("kind", ["sdf", "urdf"])
 def test_fins_are_joints_with_their_travel(tmp_path, kind):
-    """One revolute joint each, about the span at its position, with a plate of its area; the body keeps its mass."""
+    """Each fin is a revolute joint about its span at its position, with a plate of its area; the body keeps
+    its mass."""
     vehicle = torpedo()
     lost = export_vehicle(vehicle, tmp_path / f"rov.{kind}", kind)
     root = ElementTree.parse(tmp_path / f"rov.{kind}").getroot()
@@ -138,7 +139,7 @@ def test_fins_are_joints_with_their_travel(tmp_path, kind):
 @pytest.mark.parametrize("incidence", [None, 0.0, 0.6])
 @pytest.mark.parametrize("name", ["remus100", "torpedo", "eca_a9"])
 def test_the_lift_of_fins_comes_back(tmp_path, name, incidence):
-    """As LiftDrag of the fin's link, or of the body's where the angle of the flow counts in part alone."""
+    """It is a LiftDrag of the fin's link, or of the body's where the flow angle counts only in part."""
     vehicle = load_vehicle(name)
     changes = {f"actuators.{fin}.drag": [0.01, 0.3, 1.0] for fin in vehicle.actuators}
     if incidence is not None:
@@ -148,7 +149,7 @@ def test_the_lift_of_fins_comes_back(tmp_path, name, incidence):
     assert set(found.actuators) == set(vehicle.actuators)
     for fin, ours in vehicle.actuators.items():
         theirs = found.actuators[fin]
-        across = ours.span - ours.chord * (ours.span @ ours.chord)  # the file's may be rounded
+        across = ours.span - ours.chord * (ours.span @ ours.chord)  # the file's value may be rounded
         assert theirs.span == pytest.approx(across / np.linalg.norm(across), rel=1e-9, abs=1e-9)
         for key in ("chord", "area", "lift_slope", "incidence", "stall", "minimum", "maximum"):
             assert getattr(theirs, key) == pytest.approx(getattr(ours, key), rel=1e-9, abs=1e-9), key

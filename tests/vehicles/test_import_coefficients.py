@@ -1,4 +1,4 @@
-"""Vehicles whose coefficients stand in Python or MATLAB: their motion is that of Fossen's equations."""
+"""Vehicles with coefficients in Python or MATLAB move as Fossen's equations require."""
 
 import math
 
@@ -151,7 +151,7 @@ def read(folder, text, name="rov.m"):
 
 @pytest.mark.slow
 def test_matlab_moves_as_fossens_equations(tmp_path):
-    """Steps of force on each axis, floating up or sinking, and a decay with all velocities, within 0.2 %."""
+    """Force steps on each axis, floating up or sinking, and a decay with all velocities agree within 0.2 %."""
     vehicle = read(tmp_path, HEAVY).vehicle(tmp_path)
     origin = Fossen(13.5, [0.26, 0.23, 0.37], [0, 0, 0.01], [0, 0, -0.01], 1000 * 9.82 * 0.0134,
                     [6.36, 7.12, 18.68, 0.189, 0.135, 0.222], [13.7, 0, 33.0, 0, 0.8, 0],
@@ -177,7 +177,7 @@ def read_text(folder):
 @pytest.mark.slow
 @pytest.mark.parametrize("words", [REMUS, LONG], ids=["remus100", "longer"])
 def test_a_torpedo_reaches_the_speeds_of_pythonvehiclesimulator(tmp_path, words):
-    """Terminal speeds along each axis, and those with its propeller, within 1 % of the origin's equations."""
+    """Terminal speeds along each axis, and with its propeller, agree within 1 % with the original equations."""
     vehicle = read(tmp_path, pvs(words), "remus.py").vehicle(tmp_path)
     L, diam, Cd, rho = (float(words[w]) for w in ("LENGTH", "DIAM", "CDRAG", "RHO"))
     origin = Torpedo(L, diam, Cd=Cd, rho=rho)
@@ -195,7 +195,7 @@ def test_a_torpedo_reaches_the_speeds_of_pythonvehiclesimulator(tmp_path, words)
 
 @pytest.mark.slow
 def test_a_torpedo_goes_straight_where_the_munk_moment_is_left_out(tmp_path):
-    """Sway and yaw, heave and pitch at 2 m/s die out as the origin's: within 1 % of each velocity's greatest."""
+    """Sway and yaw, heave and pitch at 2 m/s decay as in the original, within 1 % of each velocity's maximum."""
     vehicle, origin = read(tmp_path, pvs(REMUS), "remus.py").vehicle(tmp_path), Torpedo()
     nu = np.array([[2.0, 0.2, 0, 0, 0, 0.3], [2.0, 0, 0.2, 0, 0.3, 0], [2.0, -0.2, 0.2, 0, 0.1, 0.3]])
     tau = np.zeros((3, 6))
@@ -219,7 +219,8 @@ FINS = """
 
 
 def test_fins_and_propeller_of_a_torpedo_act_as_in_pythonvehiclesimulator(tmp_path):
-    """Accelerations ahead at 2 m/s and 1525 rpm with deflected fins, without the torque, which is not read."""
+    """Accelerations at 2 m/s ahead and 1525 rpm with deflected fins agree, without the torque, which is not
+    read."""
     content = pvs(REMUS).replace("    def dynamics", f"{FINS}    def dynamics")
     draft, remus = read(tmp_path, content, "remus.py"), Remus()
     remus.propulsion = lambda U: Remus.propulsion(remus, U) * np.eye(6)[0]
@@ -294,7 +295,8 @@ def test_names_of_coefficients(name, meaning):
 
 
 def test_signs_of_coefficients():
-    """Added mass and drag are positive here; Fossen's coefficients are minus these; both signs are no convention."""
+    """Added mass and drag are positive here, Fossen's coefficients are their negatives; mixed signs are
+    refused."""
     given = np.diag([-5.5, -12.7, -14.57, -0.12, -0.12, -0.12])
     given[1, 5] = given[5, 1] = 1.93
     for some in (given, -given):
@@ -322,7 +324,8 @@ def test_matlab_is_read_as_matlab_reads_it(tmp_path):
 
 
 def test_python_is_not_executed(tmp_path):
-    """No call but those known, no import, no huge number; a name under a condition has no value."""
+    """Only known calls are evaluated, no imports or huge numbers; a name assigned under a condition has no
+    value."""
     (tmp_path / "a.py").write_text(
         f"open({str(tmp_path / 'made')!r}, 'w')\nimport os\nx = os.system('touch made')\ny = 9.0**9.0**9.0**9.0\n"
         "import numpy as np\nz = np.zeros((10**9, 10**9))\nm = 3\nif y:\n    m = 4\nk = [0] * 10**12\n"
@@ -342,11 +345,11 @@ def test_python_is_not_executed(tmp_path):
         read_assignments(tmp_path / "a.py")
 
 
-# What is guessed, refused or named
+# Guesses, refusals and findings
 
 
 def test_thrusters_that_a_file_lacks_are_asked_for(tmp_path):
-    """By the lines of the file that gives them, which is then the vehicle."""
+    """The message gives the lines to add to the file, which then loads as the vehicle."""
     read_text(tmp_path)
     with pytest.raises(VehicleError) as error:
         load_vehicle(tmp_path / "rov.py")
@@ -365,7 +368,7 @@ def test_thrusters_that_a_file_lacks_are_asked_for(tmp_path):
 
 
 def test_a_matrix_of_thrusters_gives_axes_and_lines_of_action(tmp_path):
-    """Its columns are their wrenches, so that B of tau = B f is the same, in axes with z up."""
+    """Its columns are the wrenches of the thrusters, so B of tau = B f is the same, in axes with z up."""
     vehicle = read(tmp_path, HEAVY).vehicle(tmp_path)
     c = np.sqrt(0.5)
     T = np.array([[c, c, -c, -c, 0, 0, 0, 0], [-c, c, -c, c, 0, 0, 0, 0], [0] * 4 + [-1] * 4,
@@ -375,7 +378,7 @@ def test_a_matrix_of_thrusters_gives_axes_and_lines_of_action(tmp_path):
 
 
 def test_what_is_not_read_is_named(tmp_path):
-    """Products of two velocities, functions that compute forces, numbers of other names."""
+    """Products of two velocities, functions that compute forces, and numbers with unknown names are listed."""
     draft = read(tmp_path, HEAVY + "Yuv = -3; Cd_cable = 1.2; tau_tether = tether(x);\n")
     text = " | ".join(draft.not_read)
     for words in (

@@ -1,4 +1,4 @@
-"""Vehicles of HoloOcean and MarineGym move as the equations of these programs; what is elsewhere is asked for."""
+"""Vehicles of HoloOcean and MarineGym move by these programs' equations; data kept elsewhere are requested."""
 
 import json
 import math
@@ -22,7 +22,7 @@ COUGUV = {
 ACTUATOR = {"fin_count": 4, "fin_area": 0.00697, "nMax": 1525, "T_n": 1.0, "D_prop": 0.14, "t_prop": 0.1,
             "KT_0": 0.4566, "KQ_0": 0.07, "KT_max": 0.1798, "KQ_max": 0.0312, "w": 0.056, "Ja_max": 0.6632}  # fmt: skip
 LIGHT = COUGUV | {"mass": 16, "length": 1.4, "diam": 0.15, "Cd": 0.3}
-"""A lighter one, as the older examples have it: buoyancy is its weight all the same."""
+"""Lighter vehicle, as in the older examples; its buoyancy still equals its weight."""
 
 BLUEROV = {
     "name": "BlueROV", "drag_coef": 0.3, "volume": 0.0113459, "coBM": 0.01,
@@ -43,7 +43,7 @@ HAUV = {
         "quadratic_damping": [8.9, 12.27, 15.278, 0.3, 0.3, 0.3],
     },
 }  # fmt: skip
-"""Hull of HAUV.yaml there, commit a72ed67; here with the rotors of BlueROV."""
+"""Hull of HAUV.yaml of MarineGym, commit a72ed67, with the rotors of BlueROV."""
 OWN = """
 extends: BlueROV.yaml
 origin: measured
@@ -77,7 +77,8 @@ def holoocean(folder, tree):
 @pytest.mark.slow
 @pytest.mark.parametrize("dynamics", [COUGUV, LIGHT], ids=["couguv", "light"])
 def test_a_torpedo_of_holoocean_reaches_its_speeds(tmp_path, dynamics):
-    """Terminal speeds along each axis, and that with its propeller, within 1 % of the equations of torpedo.py."""
+    """Terminal speeds along each axis, and with its propeller, agree within 1 % with the equations of
+    torpedo.py."""
     vehicle = holoocean(tmp_path, scenario(dynamics)).vehicle(tmp_path)
     origin = Torpedo(dynamics["length"], dynamics["diam"], m=dynamics["mass"], Cd=dynamics["Cd"])
     tau, upright = np.zeros((3, 6)), np.repeat(np.eye(3)[None], 3, axis=0)
@@ -93,7 +94,7 @@ def test_a_torpedo_of_holoocean_reaches_its_speeds(tmp_path, dynamics):
 
 @pytest.mark.parametrize("dynamics", [COUGUV, LIGHT], ids=["couguv", "light"])
 def test_matrices_of_a_torpedo_of_holoocean(tmp_path, dynamics):
-    """Mass matrix, and linear damping but for surge and sway, are those of torpedo.py in axes with z up."""
+    """Mass matrix, and linear damping except surge and sway, equal those of torpedo.py in axes with z up."""
     vehicle = holoocean(tmp_path, scenario(dynamics)).vehicle(tmp_path)
     origin = Torpedo(dynamics["length"], dynamics["diam"], m=dynamics["mass"], Cd=dynamics["Cd"])
     M = np.outer(F, F) * (origin.M_RB + origin.M_A)
@@ -107,7 +108,8 @@ def test_matrices_of_a_torpedo_of_holoocean(tmp_path, dynamics):
     "fins", [{}, {"fin_count": 3, "fin_offset_deg": 30.0, "fin_area": 0.01, "CL_delta": 0.6}]
 )
 def test_fins_of_a_torpedo_of_holoocean(tmp_path, fins):
-    """Each pushes across its radius, at half the length behind: the force and moment of `fin.tau` of HoloOcean."""
+    """Each acts across its radius, half a length behind the middle: force and moment of HoloOcean's
+    `fin.tau`."""
     actuator = ACTUATOR | {"fin_center": 0.12, "deltaMax_fin_deg": 20.0} | fins
     vehicle = holoocean(tmp_path, scenario(actuator=actuator)).vehicle(tmp_path)
     count, area, slope = (
@@ -127,7 +129,7 @@ def test_fins_of_a_torpedo_of_holoocean(tmp_path, fins):
 
 
 def test_a_scenario_in_python_and_one_of_ros_are_read(tmp_path):
-    """Without execution; the vehicle is the same."""
+    """Neither is executed; the vehicle is the same."""
     expected = holoocean(tmp_path, scenario()).vehicle(tmp_path).sha256
     tree = scenario()
     text = (
@@ -182,7 +184,7 @@ def marinegym(folder, changes=(), name="BlueROV.yaml"):
 @pytest.mark.slow
 @pytest.mark.parametrize(("hull", "mass"), [(BLUEROV, 11.2), (HAUV, 4.5)], ids=["bluerov", "hauv"])
 def test_a_vehicle_of_marinegym_moves_as_its_equations(tmp_path, hull, mass):
-    """Completed by mass, inertia and thrusters: steps of force, floating up and a decay, within 0.2 %."""
+    """With mass, inertia and thrusters added, force steps, floating up and a decay agree within 0.2 %."""
     marinegym(tmp_path, [(key, hull[key]) for key in HAUV])
     (tmp_path / "own.yaml").write_text(OWN.replace("mass: 11.2", f"mass: {mass}"))
     with pytest.warns(VehicleWarning):
@@ -193,7 +195,8 @@ def test_a_vehicle_of_marinegym_moves_as_its_equations(tmp_path, hull, mass):
 
 
 def test_thrust_of_a_rotor_at_its_limits(tmp_path):
-    """64.1 N forward and -51.5 N backward at 3900 rpm, in kgf by its curves, and the file's limits are these."""
+    """It is 64.1 N forward and -51.5 N backward at 3900 rpm, in kgf by its curves; the file's limits equal
+    these."""
     assert thrust(4.4e-7, 3900.0) == pytest.approx(
         9.81 * (4.7368e-7 * 3900**2 - 1.9275e-4 * 3900 + 8.4452e-2)
     )
@@ -216,7 +219,7 @@ def test_words_that_marinegym_does_not_use_are_listed(tmp_path):
 
 
 def test_what_stands_in_a_usd_file_is_asked_for(tmp_path):
-    """By the lines that a file beside it needs."""
+    """The message gives the lines for a file beside it."""
     with pytest.raises(VehicleError) as error:
         load_vehicle(marinegym(tmp_path))
     text = str(error.value)

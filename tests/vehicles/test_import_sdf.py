@@ -1,4 +1,4 @@
-"""Vehicles of gz-sim: their motion is that of gz-sim's equations, and nothing of their files is lost silently."""
+"""Vehicles of gz-sim move by gz-sim's equations, and nothing in their files is lost silently."""
 
 import json
 import math
@@ -29,7 +29,7 @@ def imported(folder, model):
 
 
 def changed(folder, change, model=HEAVY):
-    """Draft of a model whose `sdf` element was changed."""
+    """Return the draft of a model whose `sdf` element was changed."""
     root, _ = tree(model)
     change(root)
     path = folder / "model.sdf"
@@ -49,7 +49,7 @@ def refusal(folder, change, model=HEAVY):
 @pytest.mark.slow
 @pytest.mark.parametrize("model", [HEAVY, BASE, TETHYS], ids=lambda m: m.name)
 def test_it_moves_as_the_equations_of_gz_sim(tmp_path, model):
-    """Within 0.2 % at all times."""
+    """They agree within 0.2 % at all times."""
     force = (
         [20.0, 20.0, -20.0, 2.0, 2.0, 4.0] if model is not TETHYS else [20.0, 60.0, -60.0, 0.05, 100.0, 100.0]
     )
@@ -68,7 +68,7 @@ def test_terminal_speeds_of_bluerov2_heavy(tmp_path):
 
 
 def test_added_mass_of_the_plugin_is_that_of_the_link_and_its_sign_of_coriolis_is_named(tmp_path):
-    """The same matrix of both places; gz-sim's opposite sign of the Coriolis wrench is not followed."""
+    """Both sources give the same matrix; gz-sim's opposite sign of the Coriolis wrench is not adopted."""
     explicit, implicit = (read_foreign(write(tmp_path / f"{m.name}.sdf", m)) for m in (EXPLICIT, TETHYS))
     a, b = (x.vehicle(tmp_path).hydrodynamics["calibrated"] for x in (explicit, implicit))
     assert np.array_equal(a.added_mass, b.added_mass) and a.added_mass[1, 1] == 126.324739
@@ -89,7 +89,7 @@ SURFACE = {
 
 
 def with_fin(axis="0 0 1", kind="revolute", **words):
-    """A change that adds a link with a joint, and a plugin LiftDrag unless words is None."""
+    """Return a change that adds a link with a joint, and a LiftDrag plugin unless words is None."""
 
     def change(root):
         model = root.find("world/model")
@@ -111,7 +111,7 @@ def with_fin(axis="0 0 1", kind="revolute", **words):
 
 
 def lift_drag(nu, angle):
-    """Wrench about the base link by LiftDrag.cc of gz-sim, of a link that the joint has turned about its z axis."""
+    """Return the wrench about the base link by gz-sim's LiftDrag.cc, of a link that its joint turned about z."""
     c, s = math.cos(angle), math.sin(angle)
     turn = euler(*POSE[3:]) @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     cp = np.array(POSE[:3]) + turn @ [0.01, 0.0, 0.05]
@@ -128,7 +128,8 @@ def lift_drag(nu, angle):
 
 
 def test_a_surface_that_a_joint_turns_is_a_fin_with_the_forces_of_gz_sim(tmp_path):
-    """Upright against the axis and along it; at random velocities and angles, to what sweep takes away there."""
+    """Upright against the axis and along it, at random velocities and angles, except for the effect of sweep
+    in gz-sim."""
     bare = changed(tmp_path, with_fin(), TETHYS).vehicle(tmp_path)
     rng, eta = np.random.default_rng(3), [0.0, 0.0, -50.0, 0.0, 0.0, 0.0]
     for axis, sign in (("0 0 1", 1.0), ("0 0 -2", -1.0)):
@@ -145,7 +146,7 @@ def test_a_surface_that_a_joint_turns_is_a_fin_with_the_forces_of_gz_sim(tmp_pat
 
 
 def test_a_lift_that_an_angle_adds_to_is_a_fin(tmp_path):
-    """control_joint_rad_to_cl: the slope of the angle; the flow's own angle counts as much less as cla is below it."""
+    """control_joint_rad_to_cl is the slope by angle; the flow angle counts less by the ratio of cla to it."""
     words = SURFACE | {
         "link_name": "base_link",
         "control_joint_name": "rudder",
@@ -207,7 +208,7 @@ def test_damping_changes_sign_and_refuses_what_a_vehicle_file_cannot_hold():
 
 
 def test_thrust_is_of_radians_per_second(tmp_path):
-    """T = k ρ d⁴ n|n|; a negative coefficient turns the propeller the other way and pushes the same way."""
+    """T = k ρ d⁴ n|n|; a negative coefficient reverses the rotation and keeps the direction of thrust."""
     assert sdf.thrust_factor(-0.02, 1000.0, 0.1) == pytest.approx(0.002)
     thrusters = imported(tmp_path, HEAVY).thrusters
     assert thrusters["t2"].thrust(100.0) == pytest.approx(20.0)
@@ -215,7 +216,7 @@ def test_thrust_is_of_radians_per_second(tmp_path):
 
 
 def test_axes_and_places_of_thrusters(tmp_path):
-    """The front right one of BlueROV2 pushes back and to the right, the vertical ones down."""
+    """The front right thruster of BlueROV2 pushes back and to the right, the vertical ones down."""
     vehicle = imported(tmp_path, HEAVY)
     assert vehicle.thrusters["t0"].axis == pytest.approx([-math.sqrt(0.5), -math.sqrt(0.5), 0.0], abs=1e-3)
     assert vehicle.thrusters["t4"].axis.tolist() == [0.0, 0.0, -1.0]
@@ -227,7 +228,7 @@ def test_axes_and_places_of_thrusters(tmp_path):
 
 
 def test_limits_of_a_thruster_that_is_commanded_by_speed(tmp_path):
-    """max_thrust_cmd is in rad/s there, and a deadband is a thrust."""
+    """Its max_thrust_cmd is in rad/s, and its deadband is a thrust."""
 
     def change(root):
         thruster = root.findall("world/model/plugin")[1]
@@ -261,7 +262,7 @@ def test_the_autopilot_limits_a_thruster(tmp_path):
 
 
 def test_the_pose_of_a_frame():
-    """Roll, then pitch, then yaw about the axes of the parent; degrees and quaternions too."""
+    """Roll, then pitch, then yaw about the axes of the parent; also in degrees and as quaternions."""
     root = tree(HEAVY)[0]
     pose = root.find("world/model/link/inertial/pose")
     for text, attributes in (
@@ -278,7 +279,8 @@ def test_the_pose_of_a_frame():
 
 
 def test_poses_relative_to_frames_lead_to_the_same_vehicle(tmp_path):
-    """A thruster given in a frame of the model, and a base link that is turned and moved with all the rest."""
+    """A thruster is given in a frame of the model, and the base link is turned and moved with everything
+    else."""
 
     def change(root):
         model = root.find("world/model")
@@ -296,7 +298,7 @@ def test_poses_relative_to_frames_lead_to_the_same_vehicle(tmp_path):
 
 
 def test_the_body_frame_is_that_of_the_link_with_hydrodynamics(tmp_path):
-    """The link is moved and turned in the model, and the centre of gravity of its propellers with it, the other way."""
+    """When the link is moved and turned in the model, its propellers' centre of gravity moves the other way."""
 
     def change(root):
         element(root.find("world/model/link"), "pose", (0, 0, 1.0, 0, 0, math.pi / 2))
@@ -324,7 +326,7 @@ def test_volumes_of_shapes(shape, words, volume):
 
 
 def test_the_density_is_that_of_buoyancy(tmp_path):
-    """Uniform or graded with air above 0; without the plugin that of the others, or guessed."""
+    """It may be uniform or graded with air above 0; without the plugin it is that of the others, or guessed."""
 
     def graded(root):
         plugin = root.find("world/plugin")
@@ -353,16 +355,16 @@ def test_the_density_is_that_of_buoyancy(tmp_path):
     )
 
 
-# What is guessed, refused or named
+# Guesses, refusals and findings
 
 
 def test_every_word_is_read_refused_or_named(tmp_path):
-    """An x behind the name of any element, one after another."""
+    """Tested with an x appended to the name of each element in turn."""
     assert unnoticed(lambda: tree(HEAVY)[0], read_foreign, tmp_path / "model.sdf") == []
 
 
 def test_guesses_are_marked_in_the_file_and_listed(tmp_path, capsys):
-    """The command: what it lists as guessed is what the file says is guessed."""
+    """The command lists as guessed what the file marks as guessed."""
     source, out = write(tmp_path / "rov.sdf", HEAVY), tmp_path / "rov.yaml"
     assert boundary.run(app, ["vehicles", "import", str(source), "--out", str(out), "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
@@ -378,7 +380,7 @@ def test_guesses_are_marked_in_the_file_and_listed(tmp_path, capsys):
 
 
 def test_what_is_not_read_is_named(tmp_path, capsys):
-    """Fins, sensors and meshes for the eye, and an autopilot, by name and count."""
+    """Fins, sensors, visual meshes and an autopilot are listed by name and count."""
 
     def change(root):
         model = root.find("world/model")
@@ -401,7 +403,7 @@ def test_what_is_not_read_is_named(tmp_path, capsys):
 
 
 def test_a_file_without_shapes_or_masses_is_guessed_and_says_so(tmp_path):
-    """Neutral buoyancy, and SDF's 1 kg."""
+    """The guesses are neutral buoyancy and SDF's 1 kg."""
 
     def change(root):
         for link in root.findall("world/model/link"):
@@ -421,7 +423,7 @@ def test_a_file_without_shapes_or_masses_is_guessed_and_says_so(tmp_path):
 
 
 def test_a_moment_that_is_missing_is_that_of_sdf_and_says_so(tmp_path):
-    """A public model writes its moments as text: gz-sim takes 1 kg m² then."""
+    """A public model writes its moments as text; gz-sim then uses 1 kg m²."""
 
     def change(root):
         inertia = root.find("world/model/link[2]/inertial/inertia")
@@ -430,7 +432,7 @@ def test_a_moment_that_is_missing_is_that_of_sdf_and_says_so(tmp_path):
     draft = changed(tmp_path, change)
     assert "lacks numbers of link 'prop0': 1 kg, 1 kg m²" in draft.guessed["body.inertia"]
     assert "body.mass" not in draft.guessed
-    added = draft.values["hydrodynamics"]["calibrated"]["added_mass"]  # no body has such moments alone
+    added = draft.values["hydrodynamics"]["calibrated"]["added_mass"]  # no body can have these moments alone
     assert np.trace(draft.values["body"]["inertia"]) + np.trace(added) == pytest.approx(
         np.trace(imported(tmp_path, HEAVY).body.inertia) + 0.999
     )
@@ -473,7 +475,7 @@ LINK, PLUGIN = "world/model/link", "world/model/plugin"
     ],
 )  # fmt: skip
 def test_refusals_are_sentences(tmp_path, change, sentence):
-    """Each names the file and the element; None: an element that changes nothing."""
+    """Each names the file and the element; None marks an element that changes nothing."""
     if sentence is None:
         changed(tmp_path, change)
     else:
@@ -504,7 +506,7 @@ def test_other_files_are_refused(tmp_path):
 
 
 def test_a_prefix_needs_no_namespace(tmp_path):
-    """As in gz-sim: the element is named as it is written. UTF-16 is read, and its DOCTYPE is seen."""
+    """As in gz-sim, elements are named as written. UTF-16 is read, and its DOCTYPE is detected."""
     text = tostring(tree(HEAVY)[0], encoding="unicode").replace(
         '<link name="base_link">', '<link name="base_link"><gz:note/>'
     )
@@ -544,7 +546,7 @@ def with_mesh(uri, scale="1 1 1"):
     "uri", ["model://heavy/meshes/hull.stl", "meshes/hull.stl", "package://heavy/meshes/hull.stl"]
 )
 def test_a_collision_mesh_becomes_the_hull_and_comes_along(tmp_path, uri):
-    """Its volume is that of the mesh, its centre the place of the collision, and the file lies beside the vehicle's."""
+    """The hull has the mesh's volume, centred at the collision; the file is copied beside the vehicle's."""
     folder = tmp_path / "model"
     (folder / "meshes").mkdir(parents=True)
     vertices, faces = mesh.parametric_hull([0.4, 0.3, 0.2], 0.0135)
@@ -562,7 +564,7 @@ def test_a_collision_mesh_becomes_the_hull_and_comes_along(tmp_path, uri):
 
 
 def test_a_mesh_outside_the_folder_of_the_model_is_refused(tmp_path):
-    """Names from data are no paths: not upwards, not absolute, not through a link."""
+    """File names in data may not lead upwards, be absolute or pass through a link."""
     folder = tmp_path / "model"
     folder.mkdir()
     mesh.write_stl(tmp_path / "outside.stl", *mesh.parametric_hull([0.4, 0.3, 0.2], 0.0135))

@@ -1,4 +1,4 @@
-"""Robots of Stonefish move as its equations say, and nothing of their scenarios is lost silently."""
+"""Robots of Stonefish move by its equations, and nothing in their scenarios is lost silently."""
 
 import json
 import math
@@ -21,7 +21,7 @@ from reference.stonefish import DEAD, FLUID, RHO, TABLE, Origin, thruster, write
 
 
 def changed(folder, old, new):
-    """The scenario, with a text of its robot replaced."""
+    """Return the scenario with a text of its robot replaced."""
     path = write(folder)
     robot = folder / "data/robot.scn"
     text = robot.read_text()
@@ -39,7 +39,7 @@ def thruster_of(folder, text):
 
 @pytest.mark.slow
 def test_terminal_speeds_are_those_of_the_equations(tmp_path):
-    """Forces through the centre of gravity, along and about each axis, and floating up: within 1 %."""
+    """Forces through the centre of gravity, along and about each axis, and floating up agree within 1 %."""
     (tmp_path / "light").mkdir()
     vehicle, light = imported(write(tmp_path)), imported(write(tmp_path / "light", weight=20.0))
     origin, risen = Origin(), Origin(20.0)
@@ -61,7 +61,7 @@ def test_terminal_speeds_are_those_of_the_equations(tmp_path):
 
 @pytest.mark.slow
 def test_steps_and_decays_are_those_of_the_equations(tmp_path):
-    """At all times: tilts and spins that die out, within 1 %; steps of force, which tilt it too, within 2 %."""
+    """At all times, decaying tilts and spins agree within 1 %; force steps, which also tilt it, within 2 %."""
     vehicle, origin = imported(write(tmp_path)), Origin()
     tau, nu, R = np.zeros((6, 6)), np.zeros((6, 6)), np.repeat(np.eye(3)[None], 6, axis=0)
     tau[0, 0], tau[1, 1] = 10.0, 10.0
@@ -80,7 +80,8 @@ def test_steps_and_decays_are_those_of_the_equations(tmp_path):
 
 
 def test_mass_and_buoyancy_are_sums_of_the_parts(tmp_path):
-    """Of solids, shells and a mesh; internal ones weigh, and only buoyant ones lift. The axes turn about x."""
+    """Parts are solids, shells and a mesh; internal ones have weight, only buoyant ones lift. The axes turn
+    about x."""
     draft, origin = read_foreign(write(tmp_path)), Origin()
     body = draft.values["body"]
     assert body["mass"] == pytest.approx(origin.mass, rel=1e-9)
@@ -92,7 +93,7 @@ def test_mass_and_buoyancy_are_sums_of_the_parts(tmp_path):
 
 
 def test_a_link_at_a_joint_is_a_part_of_the_body(tmp_path):
-    """A lamp in a link of its own, at the same place: the same body, and the joint is held."""
+    """Moving a lamp to its own link at the same position gives the same body; the joint is fixed."""
     for name in "ab":
         (tmp_path / name).mkdir()
     usual = read_foreign(write(tmp_path / "a"))
@@ -124,7 +125,7 @@ def test_a_link_at_a_joint_is_a_part_of_the_body(tmp_path):
 
 
 def test_added_mass_of_shapes():
-    """Closed forms of SolidEntity.cpp; an ellipsoid has no moment about its length."""
+    """These are closed forms of SolidEntity.cpp; an ellipsoid has no moment about its length."""
     mass, turning = stonefish.added_mass("sphere", np.array([0.1]), 1000.0)
     assert mass.tolist() == pytest.approx([2.0 / 3.0 * math.pi] * 3) and not turning.any()
     mass, turning = stonefish.added_mass("cylinder", np.array([0.1, 2.0]), 1000.0)
@@ -139,7 +140,8 @@ def test_added_mass_of_shapes():
 
 
 def test_the_ellipsoid_around_points_is_that_of_the_algorithm():
-    """Its steps, written out point by point, on random points; and it reaches nearly all of them."""
+    """The algorithm's steps, written out point by point, agree on random points, nearly all of which are
+    enclosed."""
     rng = np.random.default_rng(1)
     points = rng.normal(size=(60, 3)) * [1.0, 0.5, 0.2]
     weights = {}
@@ -164,7 +166,8 @@ def test_the_ellipsoid_around_points_is_that_of_the_algorithm():
 
 
 def test_drag_of_a_plate_and_of_a_box():
-    """The side that meets the flow drags along it, all sides rub along themselves; turning rubs with the radius."""
+    """The side facing the flow has form drag, all sides have skin friction; in rotation friction grows with
+    radius."""
     box = stonefish.box_mesh(np.array([0.5, 1.0, 1.5]))
     form, skin = stonefish.drag(box, np.zeros(3), np.array([2.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
     assert form[0] == pytest.approx([-6.0 * 4.0, 0.0, 0.0]) and form[1] == pytest.approx(
@@ -189,7 +192,7 @@ def test_moments_of_a_mesh_are_those_of_its_solid():
 
 
 def test_a_thruster_of_fluid_dynamics(tmp_path):
-    """ρ D⁴ k n², along x of its origin; z points down there."""
+    """The thrust is ρ D⁴ k n², along x of its origin; z points down in Stonefish."""
     thrusters = imported(write(tmp_path)).thrusters
     surge, dive = thrusters["a"], thrusters["d"]
     assert surge.axis.tolist() == [1.0, 0.0, 0.0] and surge.position.tolist() == [-0.2, 0.2, 0.0]
@@ -201,7 +204,7 @@ def test_a_thruster_of_fluid_dynamics(tmp_path):
 
 
 def test_a_left_propeller_pushes_back_with_its_forward_side(tmp_path):
-    """Its thrust changes sign where the model has no hand."""
+    """Its thrust changes sign if the model has no handedness."""
     (tmp_path / "r").mkdir()
     (tmp_path / "l").mkdir()
     right = thruster_of(tmp_path / "r", thruster("t", "0 0 0", "0 0 0", DEAD))
@@ -232,7 +235,8 @@ def test_dynamics_of_a_rotor(tmp_path, dynamics, speed, lag):
 
 
 def test_thrust_from_a_table_and_of_the_old_syntax(tmp_path):
-    """Limits are the ends of the table; thrust_coeff and max_rpm among the specs are those of before version 1.4."""
+    """Limits are the ends of the table; thrust_coeff and max_rpm in the specs are the syntax before version
+    1.4."""
     for name in "ab":
         (tmp_path / name).mkdir()
     table = thruster_of(tmp_path / "a", thruster("t", "0 0 0", "0 0 0", TABLE))
@@ -266,7 +270,7 @@ def test_the_robot_alone_needs_its_materials(tmp_path):
 
 
 def test_files_are_those_near_the_scenario(tmp_path):
-    """Not upwards, not absolute, not through a link; in a given folder they are found."""
+    """Paths may not lead upwards, be absolute or pass through a link; files in a given folder are found."""
     path = write(tmp_path)
     robot = tmp_path / "data/robot.scn"
     (tmp_path / "scenarios/link.obj").symlink_to("/etc/passwd")
@@ -304,7 +308,7 @@ def test_a_scenario_that_includes_itself_ends(tmp_path):
 
 
 def test_a_robot_that_starts_upside_down_is_turned(tmp_path):
-    """Its body axes are those in which it is level; z of base_link is up there."""
+    """Its body axes are those in which it is level; then z of base_link is up."""
     path = changed(tmp_path, 'xyz="0 0 2" rpy="0 0 1.0"', 'xyz="0 0 2" rpy="0 3.141592653589793 1.0"')
     draft = read_foreign(path)
     assert any("upside down" in sentence for sentence in draft.different)
@@ -317,7 +321,8 @@ def test_a_robot_that_starts_upside_down_is_turned(tmp_path):
 
 
 def test_every_word_of_the_robot_is_read_refused_or_named(tmp_path):
-    """An x behind the name of any element, one after another; those of parts that only show it change nothing."""
+    """Tested with an x appended to the name of each element in turn; in purely visual parts it changes
+    nothing."""
     path = write(tmp_path)
     root = fromstring((tmp_path / "data/robot.scn").read_text())
     world = fromstring(path.read_text())
@@ -337,7 +342,8 @@ RUDDER = """<actuator name="Tail fin" type="rudder"><link name="base"/><origin x
 
 
 def test_a_rudder_acts_as_in_stonefish(tmp_path):
-    """Lift ½ρ A C_L a V² along -z × v and drag by C_D a² of its own frame, z down, at random speeds and angles."""
+    """Lift ½ρ A C_L a V² along -z × v and drag by C_D a² in its own frame, z down, at random speeds and
+    angles."""
     first, second, third, fourth = (tmp_path / name for name in "abcd")
     for folder in (first, second, third, fourth):
         folder.mkdir()
@@ -354,7 +360,7 @@ def test_a_rudder_acts_as_in_stonefish(tmp_path):
         c, s = np.cos(angle), np.sin(angle)
         own = turn @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         v = own.T @ (nu[:3] + np.cross(nu[3:], place))
-        v[2] = 0.0  # of the flow along the rudder, which counts there, a part in a thousand
+        v[2] = 0.0  # of the flow along the rudder, which counts in Stonefish: one part in a thousand
         attack, q = np.arctan2(v[1], v[0]), 0.5 * rho * 0.02 * (v @ v)
         ahead = v / np.linalg.norm(v)
         force = own @ (2.5 * attack * q * np.cross([0.0, 0.0, -1.0], ahead) - 0.8 * attack**2 * q * ahead)
@@ -373,7 +379,7 @@ def test_a_rudder_acts_as_in_stonefish(tmp_path):
 
 
 def test_the_command_imports_and_lists(tmp_path, capsys):
-    """Guesses are those of the file; sensors, servos and messages of ROS are named."""
+    """Listed guesses are those of the file; sensors, servos and ROS messages are named."""
     more = '<sensor name="imu"/><ros_subscriber thrusters="/x"/><actuator name="r" type="servo"/><world_transform'
     path, out = changed(tmp_path, "<world_transform", more), tmp_path / "rov.yaml"
     assert boundary.run(app, ["vehicles", "import", str(path), "--out", str(out), "--json"]) == 0
@@ -414,7 +420,7 @@ def test_refusals_are_sentences(tmp_path, old, new, sentence):
 
 
 def test_obj_is_read_as_polygons(tmp_path):
-    """Faces by numbers, from the end too, with normals and textures beside; the same solid as in STL."""
+    """Faces by numbers, also negative ones, with normals and textures, give the same solid as the STL."""
     write(tmp_path)
     vertices, faces = load_obj(tmp_path / "data/keel.obj")
     assert mesh_volume(vertices, faces) == pytest.approx(1000.0 * 0.3 * 0.04 * 0.1) and len(faces) == 12

@@ -1,4 +1,4 @@
-"""Robots of uuv_simulator move as its equations say; xacro is harmless, and nothing is lost silently."""
+"""Robots of uuv_simulator move by its equations; xacro is harmless, and nothing is lost silently."""
 
 import json
 import math
@@ -49,9 +49,9 @@ def refusal(folder, content):
     ids=lambda x: getattr(x, "name", ""),
 )
 def test_it_moves_as_the_equations_of_uuv_simulator(tmp_path, robot, force, ahead):
-    """Within 1 % at all times: couplings of added mass, full damping, a centre of gravity beside the origin.
+    """Within 1 % at all times, with coupled added mass, full damping and a centre of gravity off the origin.
 
-    The torpedo moves ahead, for astern uuv_simulator changes the sign of the damping by forward speed.
+    The torpedo moves ahead, because astern uuv_simulator changes the sign of the damping by forward speed.
     """
     path = write(tmp_path, text(robot))
     assert_moves_alike(imported(path), Origin(robot), force, tolerance=0.01, ahead=ahead)
@@ -93,7 +93,8 @@ def finned(*fins):
 
 
 def uuv_fin(place, turn, law, nu, deflection):
-    """Wrench of a fin about the base link by FinPlugin.cc and LiftDragModel.cc: in the plane of x and y of its link."""
+    """Return a fin's wrench about the base link by FinPlugin.cc and LiftDragModel.cc, in the xy plane of its
+    link."""
     c, s = np.cos(deflection), np.sin(deflection)
     link = turn @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     v = link.T @ (nu[:3] + np.cross(nu[3:], place))
@@ -109,7 +110,7 @@ def uuv_fin(place, turn, law, nu, deflection):
 
 
 def test_fins_act_as_in_uuv_simulator(tmp_path):
-    """At random velocities and deflections below the stall: forces of each model and their moments, to 0.1 %."""
+    """At random velocities and deflections below stall, forces and moments of each model agree to 0.1 %."""
     places = [("-0.4 0 0.04", "0 0 0", QUADRATIC), ("-0.7 0.08 0.07", "-0.79 -0.1 0.1", LINES)]
     vehicle = imported(write(tmp_path, finned(*places)))
     assert list(vehicle.actuators) == ["fin_0", "fin_1"] and vehicle.actuators["fin_0"].time_constant == 0.2
@@ -151,7 +152,7 @@ def hydrodynamic_model(**words):
 
 
 def test_models_of_shapes():
-    """The shapes of HydrodynamicModel.cc, with its 1028 kg/m³ and its disc without length."""
+    """These are the shapes of HydrodynamicModel.cc, with its 1028 kg/m³ and its disc without length."""
     sphere = uuv.coefficients(hydrodynamic_model(type="sphere", radius=0.1), None, "m")
     assert sphere["added_mass"][0, 0] == pytest.approx(2.0 / 3.0 * 1028.0 * math.pi * 1e-3)
     assert sphere["quadratic_damping"][2, 2] == pytest.approx(0.25 * 1028.0 * math.pi * 0.01)
@@ -210,7 +211,7 @@ def test_thrust_curves(content, points):
 
 
 def test_thrusters_have_places_axes_curves_and_limits(tmp_path):
-    """A dead zone and efficiencies; reversed clamps are left out, as uuv_simulator does."""
+    """They include a dead zone and efficiencies; reversed clamps are ignored, as in uuv_simulator."""
     more = (
         "</conversion><gain>2</gain><clampMin>-100</clampMin><clampMax>100</clampMax><thrustMax>5</thrustMax>"
         "<thrust_efficiency>0.5</thrust_efficiency><propeller_efficiency>0.8</propeller_efficiency>"
@@ -233,7 +234,7 @@ def test_thrusters_have_places_axes_curves_and_limits(tmp_path):
 
 
 def test_the_thruster_manager_of_the_robot_limits_its_thrusters(tmp_path):
-    """Its file is in a package near that of the description, and names the robot."""
+    """The manager's file is in a package near the description, and names the robot."""
     for package, file, content in (
         ("saga_description", "robots/saga.xacro", text(SAGA)),
         (
@@ -256,7 +257,7 @@ def test_the_thruster_manager_of_the_robot_limits_its_thrusters(tmp_path):
 
 
 def test_moments_that_no_body_has_are_kept_in_the_added_mass(tmp_path):
-    """A public robot has 0.6, 30 and 35 kg m²; the sum of both is that of the file."""
+    """A public robot has 0.6, 30 and 35 kg m²; the sum of inertia and added mass is that of the file."""
     draft = read_foreign(write(tmp_path, text(LAUV, inertia=(0.6, 0, 0, 30.0, 0, 35.0))))
     vehicle = draft.vehicle(tmp_path)
     total = vehicle.mass_matrix()[5, 5]
@@ -268,7 +269,7 @@ def test_moments_that_no_body_has_are_kept_in_the_added_mass(tmp_path):
 
 
 def test_a_urdf_with_the_plugins_of_gz_sim_is_the_vehicle_of_its_sdf(tmp_path):
-    """Links, joints and shapes have attributes there; the plugins are the same."""
+    """URDF gives links, joints and shapes by attributes; the plugins are the same."""
     root, model = gz_sim.tree(gz_sim.HEAVY)
     parts = []
     for link in model.findall("link"):
@@ -361,7 +362,7 @@ def test_xacro_runs_no_code_reads_no_other_file_and_ends(tmp_path, content, sent
 
 @pytest.mark.slow
 def test_an_expansion_that_grows_without_end_is_refused(tmp_path):
-    """Ten macros that call the next one ten times each; texts that double."""
+    """Tested with ten macros that each call the next one ten times, and with texts that double."""
     tens = "".join(
         f'<xacro:macro name="m{i}" params="">{f"<xacro:m{i + 1}/>" * 10}</xacro:macro>' for i in range(9)
     )
@@ -375,7 +376,7 @@ def test_an_expansion_that_grows_without_end_is_refused(tmp_path):
 
 
 def test_includes_are_found_in_packages_and_in_given_folders(tmp_path):
-    """By package.xml around the file, or below a folder that is given."""
+    """They are found by package.xml around the file, or below a given folder."""
     far = tmp_path / "elsewhere/shapes"
     (far / "urdf").mkdir(parents=True)
     (far / "package.xml").write_text("<package><name>shapes</name></package>")
@@ -388,18 +389,18 @@ def test_includes_are_found_in_packages_and_in_given_folders(tmp_path):
     assert expanded(file, packages_near(file, [tmp_path / "elsewhere"])).findtext("b") == "2"
 
 
-# What is guessed, refused or named
+# Guesses, refusals and findings
 
 
 def test_every_word_is_read_refused_or_named(tmp_path):
-    """An x behind the name of any element of the expanded file, one after another."""
+    """Tested with an x appended to the name of each element of the expanded file in turn."""
     path = write(tmp_path, text(SAGA))
     read = expanded(path, {})
     assert unnoticed(lambda: deepcopy(read), read_foreign, tmp_path / "robot.urdf") == []
 
 
 def test_the_command_imports_and_lists(tmp_path, capsys):
-    """Guesses are those of the file, factors are named, and the vehicle loads with its fin."""
+    """Listed guesses are those of the file, factors are named, and the vehicle loads with its fin."""
     fin = FIN.format(id=0, xyz="-0.2 0 0", rpy="0 0 0", law=QUADRATIC).replace("lauv/", "saga/")
     content = text(SAGA).replace("</robot>", f"{fin}</robot>")
     content = content.replace(
@@ -428,7 +429,8 @@ def test_the_command_imports_and_lists(tmp_path, capsys):
 
 
 def test_a_collision_mesh_of_the_displaced_volume_is_the_hull(tmp_path):
-    """By file:// in the folder, and scaled; of another volume it is none, and a sentence says so."""
+    """It may be given by file:// in the folder, and scaled; with another volume it is rejected with a
+    sentence."""
     vertices, faces = mesh.parametric_hull([0.4, 0.3, 0.2], 0.011054)
     mesh.write_stl(tmp_path / "hull.stl", 1000.0 * vertices, faces)
     shape = f'<mesh filename="file://{tmp_path}/hull.stl" scale="0.001 0.001 0.001"/>'
@@ -465,7 +467,7 @@ def test_refusals_are_sentences(tmp_path, old, new, sentence):
 
 
 def test_older_names_of_the_plugins_are_read(tmp_path):
-    """Without uuv_ and without ros."""
+    """The older names lack uuv_ and ros."""
     old = text(SAGA).replace("libuuv_", "lib").replace("_ros_plugin", "_plugin")
     usual = read_foreign(write(tmp_path, text(SAGA)))
     assert read_foreign(write(tmp_path, old, "old.xacro")).values["thrusters"] == usual.values["thrusters"]

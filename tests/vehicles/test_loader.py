@@ -1,4 +1,4 @@
-"""Files become vehicles, or one sentence that says where, what and what to do."""
+"""Files are loaded as vehicles or refused in one sentence with location, problem and remedy."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def load(tmp_path: Path, text: str, name: str = "minnow.yaml") -> Vehicle:
 
 
 def refusal(tmp_path: Path, old: str, new: str) -> str:
-    """What the loader says of the minnow with `old` exchanged for `new`, after the file's name."""
+    """Return the loader's message about the minnow with `old` replaced by `new`, after the file's name."""
     assert MINNOW.count(old) >= 1
     with pytest.raises(VehicleError) as caught:
         load(tmp_path, MINNOW.replace(old, new, 1))
@@ -72,7 +72,7 @@ def test_a_section_may_give_the_origin_of_everything_inside(tmp_path):
 
 
 def test_an_axis_in_four_digits_is_a_unit_vector(tmp_path):
-    """cos 45° is given as 0.7071; it is scaled to length 1."""
+    """cos 45° given as 0.7071 is scaled to length 1."""
     axis = load(tmp_path, MINNOW.replace("axis: [0, 0, 1]", "axis: [0, 0.7071, 0.7071]")).thrusters["up"].axis
     assert axis == pytest.approx([0.0, 0.5**0.5, 0.5**0.5], abs=1e-15)
 
@@ -272,7 +272,8 @@ def test_a_variant_replaces_lists_merges_sections_and_removes_with_null(tmp_path
 
 
 def test_a_variant_exchanges_one_kind_of_hull_for_the_other(tmp_path):
-    """A given file drops the inherited `parametric`; `parametric: true` drops the inherited file and its scale."""
+    """A given mesh file drops the inherited `parametric`; `parametric: true` drops the inherited file and its
+    scale."""
     vertices, faces = parametric_hull([0.5, 0.4, 0.3], 0.0113, [0.0, 0.0, 0.02])
     write_stl(tmp_path / "hull.stl", 1000.0 * vertices, faces)
     load(tmp_path, MINNOW + "hull: {parametric: true}\n")
@@ -314,7 +315,7 @@ def test_numbers_in_yaml_1_2_notation_are_numbers(tmp_path):
 
 @pytest.mark.parametrize("name", catalogue())
 def test_loading_takes_less_than_a_control_step(name):
-    """Under 0.1 s of processor time, the best of three."""
+    """Loading takes under 0.1 s of processor time, the best of three."""
     load_vehicle(name)
     best = min(_seconds(name) for _ in range(3))
     assert best < 0.1
@@ -327,7 +328,7 @@ def _seconds(name: str) -> float:
 
 
 def test_the_model_of_another_program_is_read_directly(tmp_path, monkeypatch, capsys):
-    """By its path or its name in the working directory; what was guessed is listed once in a run."""
+    """It is loaded by path, or by name in the working directory; guesses are listed once per run."""
     write(tmp_path / "rov.sdf", HEAVY)
     monkeypatch.chdir(tmp_path)
     for name in (tmp_path / "rov.sdf", "rov.sdf", "./rov.sdf"):
@@ -357,7 +358,7 @@ def test_a_variant_of_another_programs_model_corrects_its_guesses(tmp_path):
 
 @pytest.mark.slow
 def test_a_mesh_of_another_programs_model_is_there_while_the_program_runs(tmp_path):
-    """And a trial names such a file by its path."""
+    """A trial names such a file by its path."""
     write_stl(tmp_path / "hull.stl", *parametric_hull([0.4, 0.3, 0.2], 0.0135))
     root = tree(HEAVY)[0]
     geometry = root.find("world/model/link/collision/geometry")

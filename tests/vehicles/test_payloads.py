@@ -1,4 +1,4 @@
-"""Payloads: a vehicle with lamps and ballast is one rigid body, and its numbers are those of mechanics."""
+"""A vehicle with payloads is one rigid body with the numbers of mechanics."""
 
 from __future__ import annotations
 
@@ -34,7 +34,8 @@ def load(folder, text=MINNOW + LOADS, name="minnow.yaml"):
 
 
 def mass_matrix(m, r, box):
-    """M_RB of a homogeneous box at r about the body origin: m/12 (b² + c²), and [[m I, -m S], [m S, I - m S S]]."""
+    """Return M_RB of a homogeneous box at r about the body origin: m/12 (b² + c²), and [[m I, -m S], [m S, I
+    - m S S]]."""
     x, y, z = r
     S = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     a, b, c = np.square(box)
@@ -50,7 +51,7 @@ def test_mass_matrices_about_one_point_add(tmp_path):
 
 
 def test_two_halves_of_a_box_are_the_box(tmp_path):
-    """The front half as payload on the back half: mass, centres and inertia of the whole."""
+    """With the front half as payload of the back half, mass, centres and inertia are those of the whole."""
     a, b, c, m, V = 0.6, 0.4, 0.3, 20.0, 0.02
     half = m / 2.0 / 12.0 * np.array([b**2 + c**2, (a / 2) ** 2 + c**2, (a / 2) ** 2 + b**2])
     text = MINNOW
@@ -74,7 +75,7 @@ def test_two_halves_of_a_box_are_the_box(tmp_path):
 
 
 def test_the_trim_differs_by_the_weights_in_water(tmp_path):
-    """Level at rest needs (m - rho V) g up at each payload, as force and moment about one point."""
+    """Level rest needs (m - rho V) g up at each payload, as force and moment about one point."""
     bare, loaded = load(tmp_path, MINNOW, "bare.yaml"), load(tmp_path)
     point = {"wrench_reference": [0.0, 0.0, 0.0]}
     change = trim(loaded.replace(point)).wrench - trim(bare.replace(point)).wrench
@@ -92,7 +93,7 @@ def test_added_mass_and_thrusters_are_those_of_the_file(tmp_path):
 
 
 def test_a_variant_adds_and_removes_payloads(tmp_path):
-    """Of `extends`: the parent's payloads count once, `null` takes one off."""
+    """With `extends` the parent's payloads count once; `null` removes one."""
     load(tmp_path)
     hook = "{mass: 0.5, volume: 0, position: [0, 0, 0]}"
     more = f"origin: measured\nextends: minnow\npayloads: {{lead: null, hook: {hook}}}\n"
@@ -104,7 +105,7 @@ def test_a_variant_adds_and_removes_payloads(tmp_path):
 
 
 def test_a_written_file_has_the_sum_and_no_payloads(tmp_path):
-    """So that a fit's numbers, which are those of the loaded vehicle, are not added to again."""
+    """A fit's numbers are those of the loaded vehicle, so payloads must not be added to them again."""
     vehicle = load(tmp_path)
     write_vehicle(vehicle, tmp_path / "out.yaml")
     written = load_vehicle(tmp_path / "out.yaml")
@@ -138,7 +139,7 @@ def test_show_lists_them(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_a_mesh_is_compared_without_payloads(tmp_path):
-    """The hull's file has the body's volume alone."""
+    """The hull's file has the volume of the body alone."""
     write_stl(tmp_path / "hull.stl", *parametric_hull([0.5, 0.4, 0.3], 0.0113, [0.0, 0.0, 0.02]))
     found = check_vehicle(load(tmp_path, MINNOW + LOADS + "hull: {file: hull.stl}\n"))
     assert [f.passed for f in found if f.name.startswith("hull")] == [True, True, True]

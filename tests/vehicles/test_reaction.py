@@ -1,4 +1,4 @@
-"""Reaction torque of propellers: in the matrix of thrusts, in motion, and with two that turn against each other."""
+"""Reaction torque of propellers: in the thrust matrix, in motion, and with a counter-rotating pair."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,8 @@ def single(folder, constant=K):
 
 
 def test_the_matrix_has_the_torque_of_the_shaft_speed(tmp_path):
-    """At every speed the moment is that of the arm less k ω|ω| along the axis; a left-handed one is opposite."""
+    """At every speed the moment is that of the arm minus k ω|ω| along the axis; left-handed propellers are
+    opposite."""
     plain = fs.load_vehicle("remus100").replace({"thrusters.propeller.torque_constant": 0.0})
     for constant in (K, -K):
         vehicle = single(tmp_path, constant)
@@ -33,7 +34,8 @@ def test_the_matrix_has_the_torque_of_the_shaft_speed(tmp_path):
 
 @pytest.mark.parametrize(("constant", "side"), [(K, -1.0), (-K, 1.0)])
 def test_a_vehicle_with_one_screw_rolls_against_it(tmp_path, constant, side):
-    """About the heel at which the weight balances the torque, for it gathers way and pitches meanwhile."""
+    """It rolls about the heel at which weight balances the torque, because it gains speed and pitches
+    meanwhile."""
     vehicle = single(tmp_path, constant)
     simulator = fs.Simulator(vehicle, control_step=0.02)
     simulator.place(position=(0.0, 0.0, -20.0))

@@ -69,7 +69,8 @@ def test_a_file_of_ones_own_is_printed_like_the_catalogue(tmp_path):
 
 
 def test_a_list_of_mixed_origin_and_a_calibration_are_shown():
-    """One entry measured, the others as before: the list has the mark of its least known entry; fits are named."""
+    """With one entry measured and the rest unchanged, the list has the mark of its least known entry; fits
+    are named."""
     record = CalibrationRecord(kind="hydrodynamics", method="simulation", trials={"a": "1" * 64})
     vehicle = load_vehicle("finsrov")
     vehicle = vehicle.replace({"body.center_of_buoyancy.2": 0.02}, Provenance("guessed"))

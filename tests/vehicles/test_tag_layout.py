@@ -1,4 +1,4 @@
-"""Tag files of apriltag_ros: bundles and settings, as tags of a vehicle, and what is refused."""
+"""Tag files of apriltag_ros: bundles and settings become tags of a vehicle; invalid ones are refused."""
 
 from pathlib import Path
 
@@ -70,7 +70,7 @@ def test_settings_give_sizes_and_family_in_any_namespace(tmp_path):
 
 
 def test_a_bundle_becomes_the_tags_of_a_vehicle(tmp_path):
-    """Corners are those of each tag's own size, moved with the bundle's frame, which is turned a quarter here."""
+    """Corners have each tag's own size and move with the bundle's frame, here a quarter turn."""
     turn = quat_from_euler(0.0, 0.0, np.pi / 2)
     about = "origin: measured, source: ruler"
     tags = f"{{family: tag36h11, layout: t.yaml, {about}, position: [0.1, 0.2, 0.3], orientation: {turn.tolist()}}}"

@@ -1,4 +1,4 @@
-"""What follows directly from a vehicle's numbers."""
+"""Quantities that follow directly from a vehicle's numbers."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def leaves(tree, path=""):
 
 @EVERY
 def test_kinetic_energy_does_not_depend_on_the_point_it_is_reckoned_from(name):
-    """nuᵀ M_RB nu = m |v_g|² + omegaᵀ I omega, v_g the velocity of the centre of gravity."""
+    """nuᵀ M_RB nu = m |v_g|² + omegaᵀ I omega, with v_g the velocity of the centre of gravity."""
     vehicle = load_vehicle(name)
     nu = np.random.default_rng(1).standard_normal(6)
     v_g = nu[:3] + np.cross(nu[3:], vehicle.body.center_of_gravity)
@@ -115,7 +115,7 @@ def test_replace_makes_a_new_vehicle_and_leaves_the_old():
 
 
 def test_replace_reaches_tags_by_their_number():
-    """The ids of tags are numbers in the file and words in a dotted path."""
+    """Ids of tags are numbers in the file and text in a dotted path."""
     vehicle = load_vehicle("finsrov")
     moved = vehicle.replace({"tags.mounts.15.position": [0.08, 0.0, 0.10]})
     assert moved.tags.mounts[15].position.tolist() == [0.08, 0.0, 0.10]
@@ -188,6 +188,6 @@ def test_loading_a_vehicle_imports_nothing_heavy():
 
 
 def test_a_zero_has_no_sign():
-    """-0.0 and 0.0 are equal numbers, so the vehicles that hold them have equal hashes."""
+    """-0.0 and 0.0 are equal, so vehicles that contain them have equal hashes."""
     ways = [load_vehicle("finsrov").replace({"body.center_of_gravity": [0.0, y, 0.0]}) for y in (0.0, -0.0)]
     assert ways[0].sha256 == ways[1].sha256

@@ -1,4 +1,4 @@
-"""Bags of ROS 1 and ROS 2 from plain values: what a message does not name is zero or empty."""
+"""Bags of ROS 1 and ROS 2 from plain values; fields that a message does not name are zero or empty."""
 
 import numpy as np
 from rosbags.interfaces import Nodetype
@@ -10,12 +10,12 @@ T0 = 1_760_000_000
 
 
 def xyz(*values):
-    """Fields of a vector or point."""
+    """Return the fields of a vector or point."""
     return dict(zip("xyz", values, strict=True))
 
 
 def empty(node, of):
-    """Zero of a plain type, or an array of zeros."""
+    """Return zero of a plain type, or an array of zeros."""
     if node == Nodetype.BASE:
         return {"string": "", "bool": False}.get(of[0], 0.0 if "float" in of[0] else 0)
     (inner, name), count = of
@@ -33,7 +33,7 @@ class Bag:
             self.types.register(get_types_from_msg(text, name))
 
     def message(self, name, values):
-        """A message of a type from mappings of its fields."""
+        """Return a message of a type from mappings of its fields."""
         fields = {}
         for field, (node, of) in self.types.fielddefs[name][1]:
             value = values.get(field)
@@ -47,7 +47,7 @@ class Bag:
         return {"stamp": {"sec": whole, "nanosec": round((T0 + t - whole) * 1e9)}, "frame_id": frame}
 
     def add(self, topic, kind, make, rate=10.0, delay=0.003, seconds=10.0):
-        """Messages of `make(i, t)` at a rate; those with a header are stamped."""
+        """Add messages of `make(i, t)` at a rate; those with a header are stamped."""
         name = kind.replace("/", "/msg/", 1)
         for i in range(round(seconds * rate)):
             t = i / rate
@@ -56,7 +56,7 @@ class Bag:
         return self
 
     def write(self, path, broken=(), storage=StoragePlugin.MCAP, mode=None, version=9):
-        """Write the bag, packed where a mode is given; the messages of some topics are cut."""
+        """Write the bag, compressed if a mode is given; the messages of `broken` topics are cut."""
         if self.kind == 2:
             writer = Writer(path, version=version, storage_plugin=storage)
             if mode is not None:

@@ -1,4 +1,4 @@
-"""Tables of logs as text, and the trials that they become."""
+"""Tables of logs as text, and the trials read from them."""
 
 from finssim.trials.importers.dispatch import read_trials
 
@@ -12,7 +12,7 @@ def csv(path, /, **columns):
 
 
 def read(folder, columns, text=None, name="log.csv"):
-    """Return the trial of a table of columns, with a map where a text is given."""
+    """Return the trial of a table of columns, with a map if a text is given."""
     csv(folder / name, **columns)
     if text is not None:
         (folder / "map.yaml").write_text(text)

@@ -1,4 +1,5 @@
-"""ArduSub logs become trials: real DataFlash and telemetry logs, their axes, their clocks, their outputs, cut files."""
+"""ArduSub logs become trials: real DataFlash and telemetry logs, their axes, clocks and outputs, and cut
+files."""
 
 import shutil
 from collections import Counter
@@ -36,19 +37,19 @@ def telemetry():
 
 @pytest.mark.parametrize("which", ["dataflash", "telemetry"])
 def test_gravity_agrees_with_the_attitude(which, request):
-    """At rest the specific force is gravity upwards, turned by the attitude: axes of both are ours."""
+    """At rest the specific force is upward gravity rotated by the attitude, so both are in FinsSim's axes."""
     trial = request.getfixturevalue(which)
     angles = [np.median(trial.series(c)[1]) for c in ("roll", "pitch", "yaw")]
     felt = [np.median(trial.series(c)[1]) for c in ("ax", "ay", "az")]
     expected = quat_inverse_rotate(quat_from_euler(*angles), [0.0, 0.0, 9.81])
-    # Accelerometers of autopilots are out by a few hundredths of g.
+    # Accelerometers of autopilots are off by a few hundredths of g.
     np.testing.assert_allclose(felt, expected, atol=0.3)
     assert felt[2] > 9.5
 
 
 @pytest.mark.parametrize("which", ["dataflash", "telemetry"])
 def test_rates_are_those_of_the_attitude(which, request):
-    """The mean rate over the log is the change of the angle over its time, but for the gyroscope's bias."""
+    """Except for the gyroscope's bias, the mean rate over the log is the change of angle divided by time."""
     trial = request.getfixturevalue(which)
     for angle, rate in (("roll", "p"), ("pitch", "q"), ("yaw", "r")):
         t, values = trial.series(angle)
@@ -57,7 +58,7 @@ def test_rates_are_those_of_the_attitude(which, request):
 
 
 def test_pitching_back_and_forth_has_the_sign_of_its_rate(telemetry):
-    """d(pitch)/dt goes with +q at small roll: the angle and the rate were turned alike."""
+    """At small roll d(pitch)/dt has the sign of q: angle and rate were converted alike."""
     t, pitch = telemetry.series("pitch")
     q = np.interp(t, *telemetry.series("q"))
     moving = np.abs(q) > 0.03
@@ -66,31 +67,32 @@ def test_pitching_back_and_forth_has_the_sign_of_its_rate(telemetry):
 
 
 def test_depth_is_of_the_sensor_in_the_water(dataflash, telemetry):
-    """Both vehicles float at the surface: millimetres, where the sensor in the hull would say 9 m."""
+    """Both vehicles float at the surface: depths are millimetres, while the sensor in the hull would give 9
+    m."""
     for trial in (dataflash, telemetry):
         assert np.abs(trial.series("depth")[1]).max() < 0.05
 
 
 def test_rates_and_battery(dataflash):
-    """The IMU comes at 25 Hz, the rest at 10 Hz, each at its own times; the battery has 4 cells."""
+    """The IMU has 25 Hz, the rest 10 Hz, each at its own times; the battery has 4 cells."""
     assert len(dataflash.series("az")[0]) == 594 and len(dataflash.series("yaw")[0]) == 237
     assert 16.0 < np.median(dataflash.series("voltage")[1]) < 17.5
 
 
 def test_an_estimate_without_a_position_sensor_is_no_velocity(dataflash):
-    """That filter assumed that the vehicle stands still; the trial says why it has no u v w."""
+    """The filter assumed that the vehicle was stationary; the trial says why it has no u v w."""
     assert not dataflash.has("u")
     assert "velocity_left_out" in {one.code for one in dataflash.findings}
 
 
 def test_an_estimate_with_one_is(telemetry):
-    """The other vehicle had an acoustic position."""
+    """This vehicle had an acoustic position."""
     assert telemetry.has("u", "v", "w", "x", "y", "z")
     assert 0.05 < np.abs(telemetry.series("u")[1]).max() < 1.0
 
 
 def test_the_stick_up_pushes_up_through_all_vertical_thrusters(telemetry):
-    """The pilot ascended once: four vertical pulses of different directions become one push against the axes, up."""
+    """In the pilot's one ascent, four vertical pulses of different directions combine to one upward push."""
     vertical = [telemetry.series(f"pwm_T{n}")[1] for n in (5, 6, 7, 8)]
     np.testing.assert_array_equal(vertical[0], vertical[3])
     np.testing.assert_array_equal(vertical[1], vertical[2])
@@ -99,7 +101,7 @@ def test_the_stick_up_pushes_up_through_all_vertical_thrusters(telemetry):
 
 
 def test_arming_splits_the_log():
-    """Armed for 16 s of the minute: heartbeats come once a second."""
+    """The log is armed for 16 s of the minute, by heartbeats once a second."""
     (trial,) = read_trials([TLOG], vehicle="bluerov2_heavy", split="arming")
     assert 15.0 < trial.duration < 17.0
     (trial,) = read_trials([BIN], vehicle="bluerov2", split="arming")
@@ -111,7 +113,7 @@ def test_arming_splits_the_log():
     "file, vehicle, part", [(BIN, "bluerov2", 0.95), (BIN, "bluerov2", 0.7), (TLOG, "bluerov2_heavy", 0.9)]
 )
 def test_a_log_cut_short_opens_up_to_the_cut(tmp_path, file, vehicle, part):
-    """A flat battery in the middle of a message: what comes before is as in the whole log."""
+    """A flat battery cuts a message; everything before it is as in the whole log."""
     data = file.read_bytes()
     (tmp_path / file.name).write_bytes(data[: int(part * len(data))])
     (cut,) = read_trials([tmp_path / file.name], vehicle=vehicle)
@@ -129,7 +131,8 @@ def test_the_folder_reads_back(tmp_path, dataflash):
 
 @pytest.mark.parametrize("frame, name", [(1, "bluerov2"), (2, "bluerov2_heavy")])
 def test_outputs_push_as_the_autopilot_means_them(frame, name):
-    """A pulse longer than neutral on every output in turn gives, in our axes, the wrench signs of the frame's table."""
+    """A pulse above neutral on each output in turn gives, in FinsSim's axes, the wrench signs of the frame's
+    table."""
     vehicle = load_vehicle(name)
     directions = [1.0, -1.0, -1.0, 1.0, 1.0, -1.0, 1.0, -1.0]
     parameters = {"FRAME_CONFIG": float(frame)} | {
@@ -141,14 +144,15 @@ def test_outputs_push_as_the_autopilot_means_them(frame, name):
         thruster, sign = outputs[motor + 1]
         wrench = FROM_FOSSEN.twist(
             sign * directions[motor] * B[thruster]
-        )  # ours and Fossen's differ by half a turn
+        )  # FinsSim's and Fossen's axes differ by half a turn
         meant = np.array([forward, right, -up, roll, pitch, yaw])
         used = meant != 0.0
         np.testing.assert_array_equal(np.sign(wrench[used]), np.sign(meant[used]))
 
 
 def test_pulses_of_a_thruster_wired_the_other_way_are_left_to_the_vehicle_file():
-    """With motor_sign -1 the file itself says that short pulses push forward: the thrust must come out the same."""
+    """With motor_sign -1 the vehicle file itself makes short pulses push forward: the thrust must be the
+    same."""
     vehicle = load_vehicle("bluerov2")
     turned = vehicle.replace({"thrusters.T1.motor_sign": -1, "autopilot.directions": [-1]})
     given = {f"C{i + 1}": name for i, name in enumerate(vehicle.thrusters)}
@@ -159,7 +163,7 @@ def test_pulses_of_a_thruster_wired_the_other_way_are_left_to_the_vehicle_file()
 
 
 def test_kinds_of_messages_that_are_not_read_are_named_with_their_numbers(dataflash, telemetry):
-    """As counted by pymavlink's own iteration of both logs."""
+    """The counts agree with pymavlink's own iteration over both logs."""
     from pymavlink import mavutil
 
     for path, trial in ((BIN, dataflash), (TLOG, telemetry)):
@@ -175,7 +179,7 @@ def test_kinds_of_messages_that_are_not_read_are_named_with_their_numbers(datafl
 
 
 def test_an_explicit_map_of_outputs_comes_first(tmp_path):
-    """Two outputs exchanged, one turned."""
+    """Two outputs are exchanged and one is reversed."""
     text = "vehicle: bluerov2\nardusub: {outputs: {C1: T2, C2: T1, C3: -T3, C4: T4, C5: T5, C6: T6}}\n"
     (tmp_path / "map.yaml").write_text(text)
     (trial,) = read_trials([BIN], column_map=tmp_path / "map.yaml")
@@ -188,20 +192,21 @@ def test_an_explicit_map_of_outputs_comes_first(tmp_path):
 
 
 def test_a_frame_of_other_thrusters_is_refused():
-    """Eight motors do not drive six thrusters."""
+    """Eight motors cannot drive six thrusters."""
     with pytest.raises(CalibrationError, match="VECTORED_6DOF of the log has 8 motors"):
         read_trials([TLOG], vehicle="bluerov2")
 
 
 def test_a_passive_trial_needs_no_outputs(tmp_path):
-    """Towed or hanging: outputs that fit no thruster of the vehicle do not matter."""
+    """When towed or hanging, outputs that fit no thruster of the vehicle do not matter."""
     (tmp_path / "map.yaml").write_text("vehicle: bluerov2\npassive: true\n")
     (trial,) = read_trials([TLOG], column_map=tmp_path / "map.yaml")
     assert trial.has("p", "depth") and not any(c.startswith("pwm") for c in trial.channels)
 
 
 def test_position_deltas_become_body_velocity():
-    """A DVL that reports 5 cm forward, 2 cm right and 1 cm down in 0.1 s: u = 0.5, v = -0.2, w = -0.1 m/s."""
+    """A DVL that reports 5 cm forward, 2 cm right and 1 cm down in 0.1 s gives u = 0.5, v = -0.2, w = -0.1
+    m/s."""
     deltas = [{"dt": 0.1, "PosDX": 0.05, "PosDY": 0.02, "PosDZ": 0.01}] * 5
     log = ArduPilotLog("x.BIN", False, {"VISO": np.arange(5) * 0.1}, {"VISO": deltas})
     stream = velocity_stream(log, "auto")
@@ -210,7 +215,7 @@ def test_position_deltas_become_body_velocity():
 
 
 def test_what_is_no_log_is_refused(tmp_path):
-    """A picture with the wrong suffix, and an empty file."""
+    """A picture with the wrong suffix and an empty file are refused."""
     for content in (b"\x89PNG" + bytes(2000), b""):
         (tmp_path / "x.tlog").write_bytes(content)
         with pytest.raises(CalibrationError, match=r"x\.tlog"):
@@ -218,7 +223,7 @@ def test_what_is_no_log_is_refused(tmp_path):
 
 
 def test_a_log_under_another_name_opens_when_told(tmp_path):
-    """The content tells DataFlash from telemetry."""
+    """The content distinguishes DataFlash from telemetry."""
     shutil.copy(BIN, tmp_path / "00000042.log")
     (trial,) = read_trials([tmp_path / "00000042.log"], format="ardupilot", vehicle="bluerov2")
     assert trial.has("roll", "p", "az", "depth")

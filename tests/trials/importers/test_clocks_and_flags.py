@@ -1,4 +1,5 @@
-"""Tables from the field: flags of invalid samples, kinds of time, angles, units of pressure, dead and empty columns."""
+"""Tables from the field: flags of invalid samples, kinds of time, angles, units of pressure, constant and
+empty columns."""
 
 from pathlib import Path
 
@@ -35,7 +36,7 @@ FLAG = np.arange(N) % 10 != 3
     ],
 )
 def test_invalid_samples_are_left_out_and_counted(tmp_path, flag, how):
-    """By a flag, a value or a limit; the rest is the rest."""
+    """Samples are dropped by a flag, a value or a limit; the others are unchanged."""
     trial = read(tmp_path, {"t": T, "u": STALE, "ok_flag": flag}, f"time: t\ncolumns: [u]\n{how}")
     np.testing.assert_array_equal(trial.series("u")[1], STALE[FLAG])
     (note,) = [item for item in trial.findings if item.code == "invalid_left_out"]
@@ -43,7 +44,7 @@ def test_invalid_samples_are_left_out_and_counted(tmp_path, flag, how):
 
 
 def test_a_column_may_have_a_flag_of_its_own(tmp_path):
-    """A table of two sensors: only the columns of the one are empty."""
+    """In a table of two sensors only the columns of the flagged one become empty."""
     columns = {"t": T, "u": STALE, "depth": T, "dvl": FLAG}
     trial = read(tmp_path, columns, "time: t\ncolumns: {u: {column: u, valid: dvl}, depth: depth}")
     assert len(trial.series("u")[1]) == 180 and len(trial.series("depth")[1]) == 200
@@ -60,7 +61,7 @@ def test_a_column_may_have_a_flag_of_its_own(tmp_path):
     ],
 )
 def test_evident_flags_need_no_map(tmp_path, name, bad, column):
-    """Their usual names in tables, and figures of merit; other columns of the table stay."""
+    """The usual names of flags in tables, and figures of merit, are recognised; other columns are unchanged."""
     good = {"fom": 0.002, "fix_type": 3}.get(name, 1 if bad is not False else True)
     columns = {"t": T, column: STALE, "depth": T, name: [good if f else bad for f in FLAG]}
     trial = read(tmp_path, columns)
@@ -100,7 +101,7 @@ def test_a_table_in_memory_has_flags_too():
 
 
 def test_periods_are_summed_up_and_are_no_clock(tmp_path):
-    """The time since the row before, in ms: refused as a clock, with the cause, and read as what it is."""
+    """The time since the previous row, in ms, is refused as a clock, with the cause, and read as periods."""
     period = 60.0 + 30.0 * (np.arange(N) * 7 % 5)
     with pytest.raises(CalibrationError, match="probably the period since the last row.*kind: period"):
         read(tmp_path, {"time": period, "u": STALE}, "time: {column: time, unit: ms}\ncolumns: [u]")
@@ -114,7 +115,7 @@ def test_periods_are_summed_up_and_are_no_clock(tmp_path):
     ("bits", "unit", "wrap"), [(16, "ms", ""), (32, "us", ""), (16, "ms", ", wrap: 65536"), (8, "s", "")]
 )
 def test_counters_go_on_where_they_begin_again(tmp_path, bits, unit, wrap):
-    """A clock of so many bits; as a stamp it is refused with the cause."""
+    """A wrapping clock of this many bits continues; as a stamp it is refused with the cause."""
     step = {"ms": 700, "us": 40_000_000, "s": 1}[unit] if bits < 32 else 1_500_000
     count = (np.arange(N * 4) * step + 2**bits - 50 * step) % 2**bits
     columns = {"n": count, "u": np.arange(N * 4)}
@@ -127,7 +128,7 @@ def test_counters_go_on_where_they_begin_again(tmp_path, bits, unit, wrap):
 
 
 def test_whole_seconds_are_spread_and_never_dropped(tmp_path):
-    """A clock of seconds with 10 samples each, begun within a second: refused, or spread within 0.1 s of the truth."""
+    """A clock of whole seconds with 10 samples each is refused, or spread to within 0.1 s of the truth."""
     true = 17.37 + np.arange(N) * 0.1
     columns = {"t": np.floor(true).astype(int), "u": np.arange(N)}
     with pytest.raises(CalibrationError, match=r"clock counts steps of 1 s: .*kind: coarse"):
@@ -141,7 +142,7 @@ def test_whole_seconds_are_spread_and_never_dropped(tmp_path):
 
 
 def test_spreading_keeps_counts_that_vary():
-    """9 and 11 samples in a second: each second is full, and the order stays."""
+    """With 9 or 11 samples in a second, each second is filled and the order is kept."""
     t = np.repeat([0.0, 1.0, 2.0, 3.0], [4, 9, 11, 6])
     out = spread(t)
     assert (np.diff(out) > 0.0).all() and (np.floor(out) == t).all()
@@ -158,7 +159,7 @@ def test_a_time_of_no_kind_is_refused(tmp_path, kind):
 
 
 def test_a_few_late_rows_are_sorted_and_many_are_refused(tmp_path):
-    """Three late rows are repaired; of two sensors' clocks in one column the cause is told."""
+    """Three late rows are repaired; for two sensors' clocks in one column the cause is reported."""
     late = T.copy()
     late[[50, 51]] = late[[51, 50]]
     trial = read(tmp_path, {"t": late, "u": late})
@@ -175,7 +176,7 @@ def test_a_few_late_rows_are_sorted_and_many_are_refused(tmp_path):
 
 
 def test_angles_are_within_half_a_turn_when_they_are_read(tmp_path):
-    """Headings of 0 to 360 degrees in NED; and radians of 0 to 2 pi without a unit."""
+    """Tested with headings of 0 to 360 degrees in NED, and radians of 0 to 2 pi without a unit."""
     heading = (np.arange(N) * 7.0) % 360.0
     trial = read(
         tmp_path,
@@ -188,14 +189,14 @@ def test_angles_are_within_half_a_turn_when_they_are_read(tmp_path):
 
 
 def test_degrees_without_a_unit_stay_to_be_noticed(tmp_path):
-    """Wrapped as radians they would look like angles."""
+    """If they were wrapped as radians they would look like valid angles."""
     trial = read(tmp_path, {"t": T, "yaw": (np.arange(N) * 7.0) % 360.0})
     assert trial.channels["yaw"].max() > 300.0
 
 
 @pytest.mark.parametrize(("unit", "scale"), [("Pa", 1.0), ("hPa", 1e-2), ("kPa", 1e-3)])
 def test_the_unit_of_a_pressure_is_told_from_its_size(tmp_path, unit, scale):
-    """Absolute pressures from the surface to 5 m of sea water."""
+    """Absolute pressures from the surface to 5 m of sea water determine the unit."""
     depth = 2.5 - 2.5 * np.cos(0.2 * T)
     pressure = (101325.0 + 1025.0 * 9.80665 * depth) * scale
     assert pressure_unit(pressure) == unit
@@ -213,13 +214,13 @@ def test_a_gauge_is_not_taken_for_an_absolute_pressure(tmp_path):
     np.testing.assert_allclose(trial.channels["depth"], 1.0 + np.sin(T), rtol=1e-9)
 
 
-# Dead and empty columns.
+# Constant and empty columns.
 
 ROLL = 0.35 * np.exp(-0.2 * T) * np.cos(2.0 * T)
 
 
 def test_rates_that_never_change_lose_to_an_attitude_that_moves(tmp_path):
-    """In an import and in a table that is read as a trial, with one sentence; rates of a vehicle at rest stay."""
+    """In an import and in a table read as a trial, with one sentence; rates of a vehicle at rest are kept."""
     columns = {
         "t": T,
         "roll": ROLL,
@@ -258,7 +259,7 @@ def test_other_dead_columns_lose_as_well(tmp_path, dead, moving):
 
 
 def test_a_biased_gyroscope_does_not_kill_a_heading_that_rests(tmp_path):
-    """A compass of whole degrees on the bench, beside rates with a bias of 0.02 rad/s and noise."""
+    """A compass of whole degrees at rest, beside rates with a bias of 0.02 rad/s and noise, is kept."""
     rate = 0.02 + 0.005 * np.random.default_rng(0).normal(size=N)
     assert set(read(tmp_path, {"t": T, "yaw": 0.5 + 0.0 * T, "r": rate}).channels) == {"yaw", "r"}
 
@@ -271,7 +272,7 @@ def test_a_dead_pressure_loses_to_a_depth_that_moves(tmp_path):
 
 
 def test_an_empty_optional_column_is_left_out_with_a_note(tmp_path):
-    """As ground stations write what the vehicle does not send."""
+    """Ground stations write such columns for data that the vehicle does not send."""
     trial = read(tmp_path, {"t": T, "u": T, "V": ["--.--"] * N}, "time: t\ncolumns: {u: u, voltage: V}")
     assert set(trial.channels) == {"u"}
     assert "voltage contains no finite number and is left out" in [str(item) for item in trial.findings]
@@ -297,7 +298,8 @@ def test_an_import_ends_with_what_it_did_not_read(tmp_path):
     ],
 )
 def test_texts_of_spreadsheets_are_read(tmp_path, content):
-    """UTF-16 with and without a mark, a line for the separator, code page 1252, decimal commas."""
+    """UTF-16 with and without a byte order mark, a separator line, code page 1252 and decimal commas are
+    read."""
     (tmp_path / "log.csv").write_bytes(content)
     (trial,) = read_trials([Path(tmp_path / "log.csv")])
     np.testing.assert_array_equal(trial.channels["u"], [0.5, 0.25])

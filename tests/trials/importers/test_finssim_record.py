@@ -1,4 +1,4 @@
-"""A record of ours becomes trials without a map: every channel at its own time, phases, arming, the vehicle."""
+"""A FinsSim record becomes trials without a map: each channel at its own times, phases, arming, the vehicle."""
 
 import json
 
@@ -24,12 +24,13 @@ RAD_PER_S = 2.0 * np.pi / 60.0
 
 
 def true_rpm(t):
-    """Shaft speeds by thruster, signs of positive thrust [rpm], (8,)."""
+    """Return shaft speeds by thruster, signed by positive thrust [rpm], (8,)."""
     return 500.0 * np.sin(t + np.arange(8.0))
 
 
 def telemetry(i, t, *, rpm=True):
-    """What the motor controller tells: its IMU is turned by half a turn about z, its outputs have their own order."""
+    """Return telemetry of the motor controller: IMU turned by half a turn about z, outputs in their own
+    order."""
     thrusters = list(VEHICLE.thrusters.values())
     motor = np.zeros(VEHICLE.mcu.outputs)
     for value, thruster in zip(true_rpm(t), thrusters, strict=True):
@@ -45,7 +46,7 @@ def reading(t):
 
 
 def record(path, *, rpm=True, meta=None, states=True, vehicle=VEHICLE):
-    """Four seconds of a run that is armed from 1 s to 3 s; telemetry is 5 ms old when it comes."""
+    """Record four seconds of a run, armed from 1 s to 3 s; telemetry arrives 5 ms late."""
     with Recorder(path, vehicle, meta, epoch=1.7e9) as recorder:
         for i in range(400):
             t = 0.01 * i
@@ -64,7 +65,7 @@ def record(path, *, rpm=True, meta=None, states=True, vehicle=VEHICLE):
 
 
 def sampled(trial, name):
-    """Times and values of a channel where it has any."""
+    """Return times and values of a channel where it has samples."""
     known = np.isfinite(trial.channels[name])
     return trial.t[known], trial.channels[name][known]
 
@@ -77,7 +78,8 @@ def run(tmp_path_factory):
 
 
 def test_channels_come_back_at_their_times(run):
-    """Pose, velocity, rates, force, depth and shaft speeds equal what was recorded, in body axes and thruster order."""
+    """Pose, velocity, rates, force, depth and shaft speeds equal the recorded ones, in body axes and thruster
+    order."""
     (trial,) = read_trials([run])
     t, rates = sampled(trial, "p")
     assert t == pytest.approx(0.01 * np.arange(400), abs=1e-6), "stamps are those of the measurement"
@@ -97,7 +99,7 @@ def test_channels_come_back_at_their_times(run):
 
 
 def test_the_trial_is_of_the_recorded_vehicle_and_driven_by_its_shafts(run):
-    """No map, no option: the header is the record's; what drives the replay are the measured shaft speeds."""
+    """Without map or option the header is the record's, and measured shaft speeds drive the replay."""
     (trial,) = read_trials([run])
     assert (trial.header.vehicle, trial.header.axis, trial.header.role) == ("finsrov", ("surge",), "held-out")
     driven = drive(trial, VEHICLE)
@@ -129,7 +131,7 @@ def test_a_record_without_bridge_states_leaves_what_the_pilot_asked_for(tmp_path
 
 
 def test_events_split_a_record(run):
-    """The armed stretch alone; and phases that were announced."""
+    """Splits are the armed segment alone, and announced phases."""
     (armed,) = read_trials([run], split="arming")
     assert armed.t[-1] == pytest.approx(2.0, abs=0.011)
     (excited,) = read_trials([run], split="phase")
@@ -146,7 +148,7 @@ def test_a_cut_record_is_imported_up_to_the_cut(run, tmp_path):
 
 
 def test_a_vehicle_that_is_not_in_the_catalogue_is_noted(tmp_path):
-    """The trial has no vehicle then; another state of a known vehicle's file is noted, too."""
+    """The trial then has no vehicle; a different state of a known vehicle's file is noted, too."""
     own = VEHICLE.model_copy(update={"name": "mine"})
     record(tmp_path / "mine.mcap", vehicle=own)
     (trial,) = read_trials([tmp_path / "mine.mcap"])
@@ -172,7 +174,7 @@ def test_trial_folders_are_written(run, tmp_path):
 
 @pytest.mark.parametrize("meta", [{}, {"trial": {"vehicle": "../mine"}}], ids=["vehicle", "trial"])
 def test_a_vehicle_that_a_record_names_is_no_path(tmp_path, meta):
-    """Neither its own name nor the one for `trial.yaml`; nothing is written."""
+    """Neither its own name nor the one for `trial.yaml` may be a path; nothing is written."""
     vehicle = VEHICLE if meta else VEHICLE.model_copy(update={"name": "../mine"})
     record(tmp_path / "run.mcap", meta=meta, vehicle=vehicle)
     with pytest.raises(CalibrationError, match=r"run.mcap: vehicle '../mine' has a separator of folders"):
@@ -181,7 +183,7 @@ def test_a_vehicle_that_a_record_names_is_no_path(tmp_path, meta):
 
 
 def test_a_vehicle_that_a_record_names_is_of_the_catalogue(tmp_path, monkeypatch):
-    """A file of that name is not looked at: a note asks for --vehicle."""
+    """A local file of that name is not read: a note asks for --vehicle."""
     (tmp_path / "mine.yaml").write_text("nothing: 1", encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     record(tmp_path / "run.mcap", meta={"trial": {"vehicle": "mine.yaml"}})
@@ -191,7 +193,7 @@ def test_a_vehicle_that_a_record_names_is_of_the_catalogue(tmp_path, monkeypatch
 
 
 def test_values_of_fins_are_channels(tmp_path):
-    """Measured values by actuator, of joints; what was requested of them is no channel."""
+    """Channels are the measured values of joints by actuator; requested values are not."""
     ours = torpedo()
     with Recorder(tmp_path / "run.mcap", ours) as recorder:
         for i in range(200):

@@ -1,4 +1,5 @@
-"""Logs that need no map: Water Linked, QGroundControl, acoustic positions, NumPy, PX4; written by their documents."""
+"""Logs that need no map (Water Linked, QGroundControl, acoustic positions, NumPy, PX4), written as
+documented."""
 
 import json
 import struct
@@ -35,7 +36,8 @@ def note(trial, code):
 
 
 def report(i, version):
-    """A velocity report of the log's protocol: forward-right-down axes, stale where the bottom was lost."""
+    """Return a velocity report of the log's protocol: forward-right-down axes, stale where bottom lock was
+    lost."""
     v = (U[i], -V[i], -W[i]) if GOOD[i] else (0.56, -0.02, 0.0)
     out = {"time": PERIOD[i], **dict(zip(("vx", "vy", "vz"), v, strict=True)), "fom": 0.002, "altitude": 1.4}
     out |= {
@@ -61,7 +63,7 @@ def dead_reckoning(i):
 
 @pytest.mark.parametrize("version", ["1", "2", "3", "3.1"])
 def test_water_linked_reports_of_all_versions(tmp_path, version):
-    """v1 and v2 have no clock: their periods are summed. Reports without bottom lock are left out and counted."""
+    """v1 and v2 have no clock: their periods are summed. Reports without bottom lock are dropped and counted."""
     lines = [json.dumps(report(i, version)) for i in range(N)]
     (tmp_path / "dvl.jsonl").write_text("\n".join(lines) + "\n")
     trial = one(tmp_path / "dvl.jsonl")
@@ -76,7 +78,7 @@ def test_water_linked_reports_of_all_versions(tmp_path, version):
 
 
 def test_dead_reckoning_is_read_on_the_same_clock_only(tmp_path):
-    """position_local of version 3 has a Unix time as the velocities have; that of version 2 not."""
+    """position_local of version 3 has a Unix time, as velocities have; that of version 2 does not."""
     lines = [json.dumps(line) for i in range(N) for line in (report(i, "3.1"), dead_reckoning(i))]
     lines += [
         '{"type": "response", "success": true}',
@@ -115,7 +117,7 @@ def test_dead_reckoning_is_read_on_the_same_clock_only(tmp_path):
 
 @pytest.mark.parametrize("name", ["time", "time_of_validity"])
 def test_tables_of_a_doppler_log_need_no_map(tmp_path, name):
-    """As the maker's parser writes them, with periods, and with Unix times."""
+    """Both forms of the manufacturer's parser are read: with periods, and with Unix times."""
     times = PERIOD if name == "time" else np.round(1e6 * (1.7e9 + CLOCK)).astype(np.int64)
     trial = one(csv(tmp_path / "dvl.csv", **{name: times}, **VELOCITIES, status=0 * GOOD))
     for column, expected in (("u", U), ("v", V), ("w", W)):
@@ -156,7 +158,7 @@ def ground_station(**more):
 
 
 def test_qgroundcontrol_needs_no_map(tmp_path):
-    """Degrees in north-east-down axes, altitude upwards, `--.--` for what the vehicle does not send."""
+    """Degrees in north-east-down axes, altitude upwards, `--.--` for data that the vehicle does not send."""
     (tmp_path / "2026-05-04 10-00-00 vehicle1.csv").write_text(ground_station())
     trial = one(tmp_path / "2026-05-04 10-00-00 vehicle1.csv")
     expected = {
@@ -173,7 +175,7 @@ def test_qgroundcontrol_needs_no_map(tmp_path):
 
 
 def test_qgroundcontrol_velocities_of_the_world_become_those_of_the_body(tmp_path):
-    """North at heading north is surge; the pitch and roll are small but there."""
+    """At heading north, velocity north is surge; small pitch and roll are taken into account."""
     level = {"roll": 0.0 * T, "pitch": 0.0 * T, "heading": 90.0 + 0.0 * T, "rollRate": np.cos(T)}
     moving = {
         "localPosition.vx": 0.5 + 0.0 * T,
@@ -189,7 +191,7 @@ def test_qgroundcontrol_velocities_of_the_world_become_those_of_the_body(tmp_pat
 
 
 def test_acoustic_positions_need_no_map(tmp_path):
-    """Fixes that are not valid are left out, z is down."""
+    """Invalid fixes are dropped; z is down."""
     rows = [
         f"{1.7e9 + t:.3f},{good},{t:.3f},2.0,{1.0 + 0.01 * t:.4f},0.2"
         for t, good in zip(T, GOOD, strict=True)
@@ -204,7 +206,7 @@ def test_acoustic_positions_need_no_map(tmp_path):
 
 
 def test_numpy_archives(tmp_path):
-    """Arrays as columns, two-dimensional ones by index in a map; arrays of other lengths are named."""
+    """Arrays are columns, two-dimensional ones by index in a map; arrays of other lengths are named."""
     gyro = np.stack([np.sin(T), np.cos(T), T], axis=-1)
     np.savez(tmp_path / "run.npz", t=T, u=T**2, gyro=gyro, slow=np.arange(7), mass=11.2)
     trial = one(tmp_path / "run.npz")
@@ -224,7 +226,7 @@ def test_numpy_archives(tmp_path):
 
 
 def test_an_archive_runs_no_code(tmp_path):
-    """Python objects in it are refused, and so is what is no archive."""
+    """Python objects in an archive are refused, as are files that are not archives."""
     np.savez(tmp_path / "objects.npz", t=np.array([{}, {}], dtype=object))
     (tmp_path / "text.npz").write_text("t,u\n")
     (tmp_path / "cut.npz").write_bytes((tmp_path / "objects.npz").read_bytes()[:-30])
@@ -255,7 +257,7 @@ FORMATS = {
     "cpuload": ("uint64_t timestamp;float load;", "<Qf"),
 }
 TILT = quat_from_euler(0.2, 0.1, 0.7)
-"""Attitude in our axes."""
+"""Attitude in FinsSim's axes."""
 
 
 def message(kind, content):
@@ -263,7 +265,7 @@ def message(kind, content):
 
 
 def ulog(path, topics=tuple(FORMATS), valid=None, parameters=None):
-    """A log of 20 s: our own attitude and motion, turned into forward-right-down and north-east-down."""
+    """Write a log of 20 s: FinsSim's attitude and motion converted to forward-right-down and north-east-down."""
     half = np.array([1.0, 0.0, 0.0, 0.0])
     x, y, z, w = quat_multiply(quat_multiply(half, TILT), half)
     out = b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0) + message("B", bytes(40))
@@ -294,7 +296,7 @@ def ulog(path, topics=tuple(FORMATS), valid=None, parameters=None):
 
 
 def test_px4_logs(tmp_path):
-    """Attitude, rates, specific force, position and velocity in our axes, the last two where valid."""
+    """Attitude, rates, specific force, position and velocity in FinsSim's axes, the last two where valid."""
     pytest.importorskip("pyulog")
     trial = one(ulog(tmp_path / "dive.ulg"))
     q = np.stack([trial.series(f"q{c}")[1] for c in "xyzw"], axis=-1)
@@ -337,7 +339,7 @@ ORDER = ("T8", "T1", "T3", "T2", "T5", "T7", "T6", "T4")
 
 
 def rotors(move=0.0):
-    """Parameters of PX4 of a vehicle as bluerov2_heavy, in forward-right-down; motor 2 is moved forward [m]."""
+    """Return PX4 parameters of a bluerov2_heavy, in forward-right-down; motor 2 is moved forward [m]."""
     vehicle, found = load_vehicle("bluerov2_heavy"), {"CA_ROTOR_COUNT": 8}
     for i, name in enumerate(ORDER):
         thruster = vehicle.thrusters[name]
@@ -350,7 +352,8 @@ def rotors(move=0.0):
 
 @pytest.mark.parametrize("functions", [{}, {"PWM_AUX_FUNC1": 102, "PWM_AUX_FUNC2": 101, "PWM_AUX_REV": 2}])
 def test_rotors_of_px4_assign_the_outputs(tmp_path, functions):
-    """By place and axis, through the functions of the outputs; pulses turn for each reversal."""
+    """Position and axis match rotors to thrusters, through the functions of the outputs; each reversal flips
+    the pulses."""
     pytest.importorskip("pyulog")
     trial = one(ulog(tmp_path / "a.ulg", parameters=rotors() | functions), vehicle="bluerov2_heavy")
     first, still = 1500.0 + 10.0 * np.arange(N) % 300.0, 1500.0 + 0.0 * T
@@ -381,7 +384,7 @@ def test_rotors_of_px4_are_compared_with_the_vehicle_or_offered(tmp_path):
 
 
 def test_px4_logs_without_a_horizontal_velocity(tmp_path):
-    """As without positioning: the valid vertical velocity alone becomes no velocity of the body, and this is noted."""
+    """Without positioning, a valid vertical velocity alone gives no body velocity, and this is noted."""
     pytest.importorskip("pyulog")
     trial = one(ulog(tmp_path / "dive.ulg", valid=(False, True, False, True)))
     assert "z" in trial.channels and not {"x", "u", "v", "w"} & set(trial.channels)
@@ -406,7 +409,7 @@ def test_a_px4_log_without_motion_is_refused(tmp_path):
     (tmp_path / "broken.ulg").write_bytes(b"ULog\x01\x12\x35\x01" + bytes(3))
     with pytest.raises(CalibrationError, match="cannot be read as a PX4 log"):
         read_trials([tmp_path / "broken.ulg"])
-    # In this one pyulog goes back and forth for ever.
+    # On this file pyulog loops for ever.
     about = message("I", b"\x05char[2] aab" + bytes(20)) * 15
     (tmp_path / "endless.ulg").write_bytes(
         b"ULog\x01\x12\x35\x01" + bytes(8) + about + b"\x2c\x01\0" + bytes(97)
@@ -416,7 +419,7 @@ def test_a_px4_log_without_motion_is_refused(tmp_path):
 
 
 def test_formats_are_recognised_by_content(tmp_path):
-    """The names of the family, the special formats before the general ones; an unknown one is named with all known."""
+    """Special formats are tried before general ones; an unknown one is refused with a list of all known."""
     assert list(importers("trial"))[-1] == "csv"
     ulog(tmp_path / "a.bin")
     assert importer_of(tmp_path / "a.bin") == "ulog"
@@ -432,7 +435,7 @@ def test_formats_are_recognised_by_content(tmp_path):
 
 
 def test_known_formats_take_the_keys_of_a_map(tmp_path):
-    """Vehicle, role, offsets and windows, without saying how the columns are read."""
+    """These are vehicle, role, offsets and windows, without descriptions of the columns."""
     (tmp_path / "dvl.jsonl").write_text("\n".join(json.dumps(report(i, "1")) for i in range(N)))
     (tmp_path / "map.yaml").write_text(
         "vehicle: bluerov2\npassive: true\nsplit: {windows: {a: [0, 5], b: [6, 9]}}"
@@ -441,7 +444,7 @@ def test_known_formats_take_the_keys_of_a_map(tmp_path):
     assert first.header.passive and all(low < high for low, high in pairwise(second.t))
 
 
-# Closed words: what a log has and a trial has not is named, in every format; and so is what is invalid or dead.
+# In every format, data of a log that a trial cannot represent are named, and so are invalid or constant data.
 
 
 def npz(path, **columns):
@@ -481,7 +484,7 @@ UNKNOWN = {
 
 @pytest.mark.parametrize("name", UNKNOWN)
 def test_what_a_trial_has_not_is_named(tmp_path, name):
-    """An unknown column, field, array or topic, and the count of an unknown kind of message."""
+    """An unknown column, field, array or topic is named, and unknown kinds of messages are counted."""
     if name == "ulog":
         pytest.importorskip("pyulog")
     file, write = UNKNOWN[name]
@@ -491,13 +494,14 @@ def test_what_a_trial_has_not_is_named(tmp_path, name):
 
 
 def test_every_importer_of_logs_has_such_a_test():
-    """Bags in `test_mavros.py`, ArduSub logs in `test_ardusub.py`; a new format joins the table above."""
+    """Bags are tested in `test_mavros.py`, ArduSub logs in `test_ardusub.py`; add a new format to the table
+    above."""
     assert set(importers("trial")) == {*UNKNOWN, "rosbag", "ardupilot"} - {"npz"}
 
 
 @pytest.mark.parametrize("name", ["csv", "npz"])
 def test_a_dead_column_and_a_stale_flag_are_reported_in_tables(tmp_path, name):
-    """The rates are zero, the last velocities are stale: neither becomes a measurement in silence."""
+    """Zero rates and stale last velocities do not silently become measurements."""
     flags = np.where(GOOD, 1.0, 0.0)
     columns = {"t": T, "yaw": np.sin(T), "r": 0.0 * T, "u": np.where(GOOD, T, 77.0), "velocity_valid": flags}
     trial = one((csv if name == "csv" else npz)(tmp_path / f"a.{name}", **columns))

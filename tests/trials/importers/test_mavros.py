@@ -1,4 +1,4 @@
-"""Bags of MAVROS and of Doppler logs become trials without a map, and one unusable topic stops nothing."""
+"""Bags of MAVROS and of Doppler logs become trials without a map, and an unusable topic does not prevent it."""
 
 import numpy as np
 import pytest
@@ -122,7 +122,7 @@ def codes(trial):
 
 def test_a_bag_of_mavros_needs_no_map(bag, tmp_path):
     """Outputs by the vehicle's frame, attitude and rates of the IMU, depth of rel_alt, velocity of the odometry; no
-    set-point and no velocity of the world is taken for a measurement, and what is not read is named with its count."""
+    set-point and no world velocity counts as a measurement, and unread messages are named with their count."""
     bag.outputs().imu().odom().rel_alt().pressure().state(lambda t: 2.0 < t < 8.0)
     bag.twist("/mavros/setpoint_velocity/cmd_vel").twist("/mavros/local_position/velocity_local").twist(
         "/cmd_vel"
@@ -153,7 +153,7 @@ def test_a_bag_of_mavros_needs_no_map(bag, tmp_path):
 
 @pytest.mark.parametrize("topic", ["/mavros/global_position/raw/fix", "/gnss/fix"])
 def test_fixes_become_metres_from_the_first(bag, tmp_path, topic):
-    """A walk of 20 m north and 10 m east at 45° by the arcs of WGS 84; without a fix there is no position."""
+    """A path of 20 m north and 10 m east at 45° by the arcs of WGS 84; without a fix there is no position."""
     north, east = 20.0 * TIMES / TIMES[-1], 10.0 * np.sin(TIMES)
     lat = 45.0 + np.degrees(north / 6367381.8)  # radius of the meridian at 45°
     lon = 7.0 + np.degrees(east / (6388838.3 * np.cos(np.radians(45.0))))  # radius of the normal
@@ -172,7 +172,7 @@ def test_fixes_become_metres_from_the_first(bag, tmp_path, topic):
 
 
 def test_parameters_of_the_autopilot_give_the_directions_of_the_motors(bag, tmp_path):
-    """MOT_n_DIRECTION of /mavros/param: nothing is assumed, and the pulses of a turned motor are turned."""
+    """MOT_n_DIRECTION of /mavros/param replaces assumptions, and the pulses of a reversed motor are flipped."""
     vehicle = load_vehicle("bluerov2_heavy")
     usual = list(vehicle.autopilot.signs(8))
     signs = [-sign if i == 2 else sign for i, sign in enumerate(usual)]
@@ -202,7 +202,7 @@ def test_without_a_vehicle_outputs_keep_their_numbers(tmp_path):
 
 
 def test_pressure_gives_the_depth_where_rel_alt_is_dead(tmp_path):
-    """A column that never changes loses to one that moves; kilopascals are told from their size."""
+    """A constant column yields to one that varies; kilopascals are recognised by their size."""
     trial = one(VehicleBag().imu().rel_alt(lambda t: 0.0).pressure(scale=1e-3).write(tmp_path / "a"))
     density = load_vehicle("bluerov2_heavy").water.density
     np.testing.assert_allclose(
@@ -214,7 +214,7 @@ def test_pressure_gives_the_depth_where_rel_alt_is_dead(tmp_path):
 
 
 def test_a_dead_sensor_loses_to_one_that_moves(tmp_path):
-    """Two IMUs of one kind: the one whose rates are zero throughout is left out, with one sentence."""
+    """Of two IMUs of one kind, the one with zero rates throughout is dropped, with one sentence."""
     trial = one(VehicleBag().imu("/a/imu", scale=0.0).imu("/b/imu").write(tmp_path / "a"))
     np.testing.assert_allclose(trial.series("p")[1], 0.1 * np.sin(TIMES), atol=1e-12)
     (note,) = [item for item in trial.findings if item.code == "stream_dead"]
@@ -230,7 +230,7 @@ def test_a_dead_sensor_loses_to_one_that_moves(tmp_path):
 
 @pytest.mark.parametrize("kind", ["OverrideRCIn", "RCIn"])
 def test_pilots_channels_go_through_the_mixer_in_manual(tmp_path, kind):
-    """Forward at half: by ArduSub's own factors. Disarmed nothing turns, and other modes are left out and counted."""
+    """Half forward, by ArduSub's own factors. Disarmed, nothing turns; other modes are dropped and counted."""
     forward, released = 1700.0, 65535.0
     sticks = lambda t: [1500, 1500, 1500, 1500, forward if t != 5.0 else released, 1500]  # noqa: E731
     bag = VehicleBag().imu().pilot(sticks, kind, "/mavros/rc/in" if kind == "RCIn" else "/mavros/rc/override")
@@ -246,7 +246,7 @@ def test_pilots_channels_go_through_the_mixer_in_manual(tmp_path, kind):
 
 
 def test_messages_that_say_they_know_nothing_are_left_out(bag, tmp_path):
-    """Covariances of -1: an IMU without rates, and velocities without a measurement."""
+    """Covariances of -1 mark an IMU without rates, and velocities without a measurement."""
     bag.imu(known=(True, False, True)).odom(bad=lambda i: i % 4 == 0)
     trial = one(bag.write(tmp_path / "a"))
     np.testing.assert_allclose(trial.series("u")[1], np.cos(TIMES)[np.arange(N) % 4 != 0], atol=1e-12)
@@ -258,7 +258,8 @@ def test_messages_that_say_they_know_nothing_are_left_out(bag, tmp_path):
 
 
 def test_a_doppler_log_is_read_in_its_own_axes(bag, tmp_path):
-    """Forward-right-down; without bottom lock, or with a figure of merit of 2 m/s, a velocity is none."""
+    """Its axes are forward-right-down; without bottom lock, or with a figure of merit of 2 m/s, velocities
+    are dropped."""
     trial = one(bag.dvl(valid=lambda i: i % 5 != 3).write(tmp_path / "a"))
     good = (np.arange(N) % 5 != 3) & (np.arange(N) % 10 != 0)
     t, u = trial.series("u")
@@ -272,14 +273,15 @@ def test_a_doppler_log_is_read_in_its_own_axes(bag, tmp_path):
 
 
 def test_a_doppler_log_comes_before_the_estimate_of_the_autopilot(bag, tmp_path):
-    """As position deltas in ArduSub logs; its position stays, and one line says that the velocity is the sensor's."""
+    """It is preferred, as position deltas in ArduSub logs are; the position is kept, and one line names the
+    source."""
     trial = one(bag.odom().imu().dvl().write(tmp_path / "a"))
     np.testing.assert_allclose(trial.series("v")[1], np.cos(TIMES)[np.arange(N) % 10 != 0], atol=1e-12)
     assert "x" in trial.channels and {"velocity_at_sensor", "columns_left_out"} <= set(codes(trial))
 
 
 def test_one_unusable_topic_does_not_refuse_a_bag(bag, tmp_path):
-    """Messages that are cut, and a topic whose samples are all invalid."""
+    """Tested with cut messages, and with a topic whose samples are all invalid."""
     bag.imu().dvl(valid=lambda i: False).odom()
     bag.pressure("/other/pressure")
     trial = one(bag.write(tmp_path / "a", broken=("/mavros/local_position/odom",)))
@@ -294,7 +296,7 @@ def test_one_unusable_topic_does_not_refuse_a_bag(bag, tmp_path):
 
 
 def test_a_topic_with_the_clock_of_another_computer_is_timed_by_receipt(tmp_path):
-    """Stamps that count from the start of an autopilot beside Unix times."""
+    """Its stamps count from the start of an autopilot, while others are Unix times."""
     bag = VehicleBag().imu().pressure()
     header = bag.header
     bag.header = lambda t: header(t - T0 + 100.0)
@@ -306,7 +308,7 @@ def test_a_topic_with_the_clock_of_another_computer_is_timed_by_receipt(tmp_path
 
 
 def test_a_bag_without_definitions_of_mavros_is_read(tmp_path):
-    """Recorders before ROS 2 Iron write none; those of an unknown type stop nothing."""
+    """Recorders before ROS 2 Iron write no definitions; topics of an unknown type are skipped."""
     bag = VehicleBag().outputs().imu()
     bag.write(tmp_path / "old", version=8, storage=StoragePlugin.SQLITE3)
     trial = one(tmp_path / "old")

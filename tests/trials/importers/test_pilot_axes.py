@@ -1,4 +1,5 @@
-"""Logs without outputs: the pilot's axes through the mixer; and recordings of BlueOS, which hold telemetry as JSON."""
+"""Logs without outputs, from the pilot's axes through the mixer; and BlueOS recordings, with telemetry as
+JSON."""
 
 import json
 import struct
@@ -29,14 +30,15 @@ MANUAL, ALT_HOLD = 19, 2
 
 
 def pulses_of(trial):
-    """(n, thrusters) without rows that are not known."""
+    """Return pulses, (n, thrusters), without unknown rows."""
     return np.stack(
         [trial.series(f"pwm_{name}")[1] for name in load_vehicle(trial.header.vehicle).thrusters], -1
     )
 
 
 def test_a_real_logs_sticks_give_its_outputs(monkeypatch):
-    """RCIN of a real dive through the mixer is RCOU of it, to the rounding of pulses, while it is armed in MANUAL."""
+    """RCIN of a real dive through the mixer equals its RCOU, to the rounding of pulses, while armed in
+    MANUAL."""
     (outputs,) = read_trials([BIN], vehicle="bluerov2", split="arming")
     monkeypatch.setattr(ardusub, "_pulses", lambda *_: [])
     (sticks,) = read_trials([BIN], vehicle="bluerov2", split="arming")
@@ -47,7 +49,7 @@ def test_a_real_logs_sticks_give_its_outputs(monkeypatch):
 
 
 class Dive:
-    """Messages of a dive at 10 Hz: a second disarmed, then armed with sticks, the last second in ALT_HOLD."""
+    """Messages of a dive at 10 Hz: one second disarmed, then armed with sticks, the last second in ALT_HOLD."""
 
     def __init__(self, sticks=None):
         self.messages = []
@@ -82,7 +84,7 @@ class Dive:
         self.add(time, 255, 190, "MANUAL_CONTROL", {"target": 1, "buttons": 0, **axes})
 
     def tlog(self, path):
-        """As a ground station writes it."""
+        """Write the dive as a ground station does."""
         from pymavlink.dialects.v20 import ardupilotmega
 
         with path.open("wb") as file:
@@ -95,7 +97,8 @@ class Dive:
         return path
 
     def mcap(self, path):
-        """As BlueOS' recorder writes it: a channel a message, a copy of all in mavlink/out, flags and kinds by name."""
+        """Write the dive as BlueOS' recorder does: one channel per message, all also in mavlink/out, flags
+        and kinds by name."""
         from mcap.writer import Writer
 
         modes = {209: "MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | MAV_MODE_FLAG_SAFETY_ARMED"}
@@ -125,7 +128,7 @@ class Dive:
 @pytest.mark.parametrize("form", ["tlog", "mcap"])
 @pytest.mark.parametrize("sticks", ["channels", "joystick"])
 def test_axes_in_manual_become_pulses(tmp_path, form, sticks):
-    """Half ahead, a quarter down, a little of the others: neutral while disarmed, left out in another mode."""
+    """Half ahead, a quarter down, a little of the others: neutral while disarmed, dropped in another mode."""
     path = getattr(Dive(sticks), form)(tmp_path / f"dive.{form}")
     (trial,) = read_trials([path], vehicle="bluerov2_heavy")
     expected = Mixer.of_frame("VECTORED_6DOF").pulses([-0.1, 0.05, -0.1, -0.25, 0.5, 0.0])
@@ -138,7 +141,7 @@ def test_axes_in_manual_become_pulses(tmp_path, form, sticks):
 
 
 def test_a_recording_of_blueos_is_what_a_tlog_is(tmp_path):
-    """The real telemetry, recorded as JSON instead, gives the same trial; one that was cut opens up to the cut."""
+    """The real telemetry recorded as JSON gives the same trial; a cut recording is read up to the cut."""
     from pymavlink import mavutil
 
     dive, log = Dive(), mavutil.mavlogfile(str(TLOG))
@@ -160,14 +163,15 @@ def test_a_recording_of_blueos_is_what_a_tlog_is(tmp_path):
 
 
 def test_without_a_frame_there_are_no_inputs(tmp_path):
-    """A log that names no frame, of a vehicle without an autopilot: its motion is read, nothing is made up."""
+    """If the log names no frame and the vehicle has no autopilot, its motion is read and no inputs are
+    invented."""
     path = Dive("channels").tlog(tmp_path / "dive.tlog")
     log = ardusub.read(path, Request(ColumnMap(), HEAVY.replace({"autopilot": None})))
     assert not any("pwm_T1" in stream.channels for stream in log.streams)
 
 
 def test_check_judges_such_a_dive(tmp_path):
-    """`trials check` takes the pulses as commands, and says of each axis what they tell."""
+    """`trials check` takes the pulses as commands, and reports what they identify on each axis."""
     path = Dive("channels").tlog(tmp_path / "dive.tlog")
     (report,) = check_trials(read_trials([path], vehicle="bluerov2_heavy"))
     assert report.verdict != "refused" and report.inputs == "pwm"
@@ -177,7 +181,7 @@ def test_check_judges_such_a_dive(tmp_path):
 @pytest.mark.slow
 def test_a_dive_of_sticks_alone_identifies_the_vehicle(tmp_path):
     """Steps ahead, astern and of yaw in the water of `ardusub-sitl`, with sticks, attitude and a DVL's deltas on the
-    ground station's log: the fit finds the damping and the added mass of the vehicle file, as well as the scale of
+    ground station's log: the fit finds damping and added mass of the vehicle file as precisely as the scale of
     thrust, 6 % low by its prior, is known."""
     world, mixer, dive = (
         SitlWorld(HEAVY, start=Station((0.0, 0.0, -20.0), 0.0)),

@@ -15,7 +15,7 @@ from trials.importers.bags import T0, Bag, xyz
 
 MOTORS = "std_msgs/Header header\nstring[] name\nfloat64[] speed\nstring state"
 LATENCY = 0.03
-"""From the stamp of a message to its arrival [s]."""
+"""Delay from the stamp of a message to its arrival [s]."""
 
 
 def odometry(i, t):
@@ -46,7 +46,7 @@ SECONDS = 4.0
 
 
 def written(folder, storage, topics=("/odom", "/imu", "/wrench", "/pressure"), mode=None):
-    """A bag of 4 s, packed where a mode is given."""
+    """Write a bag of 4 s, compressed if a mode is given."""
     bag = Bag(types={"lab_msgs/msg/Motors": MOTORS})
     for topic in topics:
         bag.add(topic, *TOPICS[topic], delay=LATENCY, seconds=SECONDS)
@@ -65,7 +65,7 @@ def mapped(path, text, tmp_path):
 
 
 def test_topics_of_usual_types_need_no_map(tmp_path, storage):
-    """Odometry, Imu, WrenchStamped and FluidPressure at their own rates, in SI."""
+    """Odometry, Imu, WrenchStamped and FluidPressure are read at their own rates, in SI units."""
     (trial,) = read_trials([written(tmp_path / "run7", storage)])
     assert trial.name == "run7"
     expected = {"u": (0.5, 80), "r": (0.3, None), "az": (9.81, 200), "tau_x": (12.0, 40), "tau_n": (1.2, 40)}
@@ -78,7 +78,7 @@ def test_topics_of_usual_types_need_no_map(tmp_path, storage):
 
 
 def test_the_gyroscope_comes_before_the_rates_of_an_odometry(tmp_path, storage):
-    """Both hold p, q, r: those of the Imu are taken, and it is said."""
+    """Both contain p, q, r: those of the Imu are used, and this is reported."""
     (trial,) = read_trials([written(tmp_path / "run", storage)])
     assert len(trial.series("p")[0]) == 200
     assert any(
@@ -88,19 +88,20 @@ def test_the_gyroscope_comes_before_the_rates_of_an_odometry(tmp_path, storage):
 
 
 def test_stamps_of_the_header_come_before_times_of_recording(tmp_path, storage):
-    """Messages arrive 30 ms after their stamps; a map may ask for either."""
+    """Messages arrive 30 ms after their stamps; a map may choose either."""
     bag = written(tmp_path / "run", storage, ("/odom", "/array"))
     columns = "/array: {columns: {rpm_T1: 'data[0]', rpm_T2: data.2}}"
     stamped = mapped(bag, f"topics:\n  /odom: {{}}\n  {columns}\n", tmp_path)
     received = mapped(bag, f"topics:\n  /odom: {{stamps: received}}\n  {columns}\n", tmp_path)
-    # A bare array has no stamp: its times are those of recording, 30 ms after the stamps of the odometry.
+    # A bare array has no stamp, so its times are those of recording, 30 ms after the stamps of the odometry.
     np.testing.assert_allclose(stamped.series("rpm_T1")[0][0] - stamped.series("u")[0][0], 0.03, atol=1e-6)
     np.testing.assert_allclose(received.series("rpm_T1")[0][0], received.series("u")[0][0], atol=1e-6)
     np.testing.assert_allclose(stamped.series("rpm_T2")[1], 3.0 + np.arange(40))
 
 
 def test_custom_messages_by_path_name_and_phase(tmp_path, storage):
-    """A type that only the bag defines: elements by the message's own names, units, and the phase it says."""
+    """The type is defined only in the bag: elements by the message's own names, units, and the phase that it
+    names."""
     bag = written(tmp_path / "run", storage, ("/motors", "/odom"))
     text = """
 topics:
@@ -120,7 +121,7 @@ topics:
 
 
 def test_a_forward_right_down_topic_is_turned(tmp_path, storage):
-    """A left turn that an odometry in FRD axes reports with a minus."""
+    """A left turn is negative in an odometry in FRD axes."""
     bag = written(tmp_path / "run", storage, ("/odom",))
     trial = mapped(bag, "topics:\n  /odom: {frame: FRD}\n", tmp_path)
     assert trial.series("r")[1][0] == pytest.approx(-0.3)
@@ -128,7 +129,7 @@ def test_a_forward_right_down_topic_is_turned(tmp_path, storage):
 
 
 def test_a_single_file_without_its_folder_opens(tmp_path):
-    """A .mcap alone, as Foxglove and loggers of vehicles leave it."""
+    """Foxglove and loggers of vehicles write a single .mcap."""
     bag = written(tmp_path / "run", StoragePlugin.MCAP)
     (trial,) = read_trials([next(bag.glob("*.mcap"))])
     assert trial.has("u", "tau_x", "depth")
@@ -146,7 +147,8 @@ def test_a_folder_that_lost_its_metadata_opens(tmp_path, storage):
 @pytest.mark.parametrize("part", [0.8, 0.5])
 @pytest.mark.parametrize("mode", [None, CompressionMode.STORAGE])
 def test_an_mcap_cut_off_opens_up_to_the_cut(tmp_path, part, mode):
-    """The recorder lost power: no index, no end; what was written whole is there, also inside the last chunk."""
+    """After a power loss there is no index and no end; complete messages are read, also inside the last
+    chunk."""
     data = next(written(tmp_path / "run", StoragePlugin.MCAP, mode=mode).glob("*.mcap")).read_bytes()
     (tmp_path / "cut.mcap").write_bytes(data[: int(part * len(data))])
     (trial,) = read_trials([tmp_path / "cut.mcap"])
@@ -168,7 +170,7 @@ def test_an_mcap_cut_off_opens_up_to_the_cut(tmp_path, part, mode):
     ],
 )
 def test_one_sentence_says_what_a_bag_has_not(tmp_path, text, sentence):
-    """Topics, types and fields that are not there, with those that are."""
+    """Topics, types and fields that do not exist are named, with those that do."""
     bag = written(tmp_path / "run", StoragePlugin.MCAP, tuple(TOPICS))
     with pytest.raises(CalibrationError) as refused:
         mapped(bag, f"topics:\n  {text}\n", tmp_path)
@@ -176,7 +178,7 @@ def test_one_sentence_says_what_a_bag_has_not(tmp_path, text, sentence):
 
 
 def test_two_sources_of_one_column_are_refused(tmp_path):
-    """Nobody but the user knows which is better."""
+    """Only the user can decide which source is better."""
     bag = written(tmp_path / "run", StoragePlugin.MCAP, ("/odom", "/array"))
     with pytest.raises(CalibrationError, match="u is in /odom and in /array"):
         mapped(
@@ -188,7 +190,7 @@ def test_two_sources_of_one_column_are_refused(tmp_path):
 
 @pytest.mark.parametrize("name", ["broken.mcap", "broken.db3"])
 def test_what_is_no_bag_is_refused(tmp_path, name):
-    """A file of zeros, and a kind that was given wrongly."""
+    """A file of zeros and a wrongly given kind are refused."""
     (tmp_path / name).write_bytes(bytes(4096))
     with pytest.raises(CalibrationError, match="broken"):
         read_trials([tmp_path / name])
@@ -198,7 +200,7 @@ def test_what_is_no_bag_is_refused(tmp_path, name):
 
 
 def test_a_small_bag_that_unpacks_to_much_is_refused(tmp_path, monkeypatch):
-    """A message of 300 MB that is 30 kB in the bag, where 128 MiB may be taken."""
+    """A message of 300 MB takes 30 kB in the bag; the limit here is 128 MiB."""
     pytest.importorskip("resource")
     writer = Writer(tmp_path / "bomb", version=8, storage_plugin=StoragePlugin.SQLITE3)
     writer.set_compression(CompressionMode.MESSAGE, CompressionFormat.ZSTD)
@@ -215,7 +217,7 @@ def test_a_small_bag_that_unpacks_to_much_is_refused(tmp_path, monkeypatch):
 
 
 def packed_bag(folder, storage, size):
-    """A bag packed as a whole file, of one message of so many zeros after one that says something."""
+    """Return a bag compressed as a whole file, with one meaningful message followed by one of `size` zeros."""
     writer = Writer(folder, version=8, storage_plugin=storage)
     writer.set_compression(CompressionMode.FILE, CompressionFormat.ZSTD)
     with writer:
@@ -225,7 +227,7 @@ def packed_bag(folder, storage, size):
 
 
 def test_a_bag_that_is_packed_as_a_whole_is_unpacked_up_to_a_limit(tmp_path, storage, monkeypatch):
-    """To a directory of its own on the disk; what is larger is not written, and its files may be given instead."""
+    """It is unpacked to its own directory on disk; larger bags are not written, and must be given unpacked."""
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "scratch"))
     (tmp_path / "scratch").mkdir()
     bag = packed_bag(tmp_path / "bomb", storage, 64 << 20)
@@ -241,7 +243,7 @@ def test_a_bag_that_is_packed_as_a_whole_is_unpacked_up_to_a_limit(tmp_path, sto
 
 
 def test_a_bag_that_is_packed_as_a_whole_says_what_the_plain_one_says(tmp_path, storage):
-    """With a frame to be skipped before it, too."""
+    """This holds also after a skippable frame."""
     plain = written(tmp_path / "plain", storage)
     packed = written(tmp_path / "packed", storage, mode=CompressionMode.FILE)
     (file,) = packed.glob("*.zstd")

@@ -1,4 +1,4 @@
-"""A pilot's sticks through ArduSub's mixer: pulses that push the vehicle where the pilot pointed."""
+"""A pilot's sticks through ArduSub's mixer become pulses that push the vehicle in the commanded direction."""
 
 import numpy as np
 import pytest
@@ -17,11 +17,12 @@ PUSHES = {
     "stick_pitch": (4, -1.0),
     "stick_yaw": (5, -1.0),
 }
-"""Stick -> axis of forward-left-up and its sign: right is -y, nose up is -pitch, clockwise from above is -yaw."""
+"""Stick -> axis of forward-left-up and its sign: right is -y, nose up is -pitch, clockwise from above is
+-yaw."""
 
 
 def trial(tmp_path, text, **columns):
-    """A log of sticks under a map."""
+    """Return the trial of a log of sticks under a map."""
     table = {"t": [0.1 * k for k in range(20)], **{name: [value] * 20 for name, value in columns.items()}}
     return read(tmp_path, table, f"{text}time: t\ncolumns: [{', '.join(columns)}]\n")
 
@@ -29,7 +30,7 @@ def trial(tmp_path, text, **columns):
 @pytest.mark.parametrize("frame", FRAMES)
 @pytest.mark.parametrize("stick", PUSHES)
 def test_each_stick_pushes_its_way(tmp_path, frame, stick):
-    """Through the mixer, the vehicle file's thrusters and its speed controllers."""
+    """Tested with the mixer, the vehicle file's thrusters and its speed controllers."""
     if (frame, stick) == ("VECTORED", "stick_pitch"):
         pytest.skip("six thrusters do not pitch")
     vehicle = load_vehicle(FRAMES[frame])
@@ -44,7 +45,8 @@ def test_each_stick_pushes_its_way(tmp_path, frame, stick):
 
 
 def test_directions_and_gain(tmp_path):
-    """MOT_n_DIRECTION turns a motor's pulses; the pilot gain scales the sticks before the mixer; both from the map."""
+    """MOT_n_DIRECTION reverses a motor's pulses; the pilot gain scales the sticks before the mixer; the map
+    gives both."""
     text = "vehicle: bluerov2\nardusub: {frame: VECTORED, gain: 0.5, motor_directions: [1, 1, 1, 1, -1, 1]}\n"
     found = trial(tmp_path, text, stick_throttle=1.0)
     assert (found.series("pwm_T5")[1][0], found.series("pwm_T6")[1][0]) == (1700.0, 1300.0)
@@ -60,12 +62,12 @@ def test_directions_and_gain(tmp_path):
     ],
 )
 def test_what_cannot_be_mixed_is_refused(tmp_path, text, columns, said):
-    """One sentence with what to give."""
+    """The refusal is one sentence that says what to give."""
     with pytest.raises(CalibrationError, match=said):
         trial(tmp_path, text, **columns)
 
 
 def test_gauge_pressure_has_its_zero_at_the_surface(tmp_path):
-    """surface_pressure: 0."""
+    """surface_pressure is 0."""
     found = trial(tmp_path, "vehicle: bluerov2\nsurface_pressure: 0\n", pressure=9810.0)
     np.testing.assert_allclose(found.series("depth")[1], 1.0, rtol=1e-6)

@@ -1,4 +1,4 @@
-"""Tables with a map become trials: units, frames, time, several files, splitting; and what is refused."""
+"""Tables with a map become trials: units, frames, time, several files, splitting and refusals."""
 
 from pathlib import Path
 
@@ -25,7 +25,7 @@ def shipped_map(name):
 
 @pytest.fixture
 def folder(tmp_path):
-    """Writes files by name and text into one folder, and returns their paths."""
+    """Function that writes files by name and text into one folder, and returns their paths."""
 
     def write(**files):
         paths = []
@@ -39,7 +39,7 @@ def folder(tmp_path):
 
 
 def table(columns, n=50, rate=10.0, time="t", start=0.0):
-    """CSV text of columns given as functions of time."""
+    """Return CSV text of columns given as functions of time."""
     t = start + np.arange(n) / rate
     rows = [",".join([time, *columns])]
     rows += [",".join(f"{f(x):.15g}" for f in [lambda x: x, *columns.values()]) for x in t]
@@ -47,7 +47,7 @@ def table(columns, n=50, rate=10.0, time="t", start=0.0):
 
 
 def one(paths, map_text, tmp_path, **options):
-    """The only trial of some files under a map."""
+    """Return the only trial of some files under a map."""
     map_file = tmp_path / "map.yaml"
     map_file.write_text(map_text, encoding="utf-8")
     trials = read_trials(paths, column_map=map_file, **options)
@@ -56,7 +56,8 @@ def one(paths, map_text, tmp_path, **options):
 
 
 def test_the_shipped_map_reads_the_recordings_of_a_drifting_vehicle(tmp_path):
-    """Motion capture and IMU of the Hinsdale wave laboratory: one trial per pair of files, gravity up in both."""
+    """Motion capture and IMU of the Hinsdale wave laboratory give one trial per pair of files, with gravity
+    up in both."""
     map_file = tmp_path / "hinsdale.yaml"
     map_file.write_text(shipped_map("hinsdale.yaml"), encoding="utf-8")
     folders = import_trials(sorted(HINSDALE.glob("*.csv")), out=tmp_path / "trials", column_map=map_file)
@@ -65,15 +66,15 @@ def test_the_shipped_map_reads_the_recordings_of_a_drifting_vehicle(tmp_path):
         trial = load_trial(folder)
         assert trial.header.passive and trial.header.vehicle == "bluerov2_heavy"
         assert trial.has("x", "y", "z", "qx", "qy", "qz", "qw", "p", "q", "r", "ax", "ay", "az")
-        # An accelerometer that stands still feels 9.81 upwards; its rates are those of a hanging body.
+        # A stationary accelerometer measures 9.81 upwards; its rates are those of a hanging body.
         assert np.median(trial.series("az")[1]) == pytest.approx(9.75, abs=0.1)
         assert np.abs(trial.series("p")[1]).max() < 0.6
-    # Rows of the mocap and of the IMU stay apart: 20 Hz among about 100 Hz.
+    # Rows of the mocap and of the IMU remain separate: 20 Hz among about 100 Hz.
     assert len(trial.series("p")[0]) == 543 and len(trial.series("x")[0]) == 2764
 
 
 def test_what_is_written_reads_back_with_the_same_numbers(folder, tmp_path):
-    """The folder holds the trial that was read."""
+    """The folder contains the trial that was read."""
     paths = folder(log__csv=table({"u": np.sin, "tau_x": np.cos}, rate=7.0))
     (trial,) = read_trials(paths)
     (written,) = import_trials(paths, out=tmp_path / "out", vehicle="finsrov")
@@ -109,7 +110,7 @@ def test_time_units_and_unix_times_start_at_zero(folder, tmp_path, unit, per_sec
 
 
 def test_written_dates_are_times(folder, tmp_path):
-    """ISO dates with fractions."""
+    """ISO dates with fractions are read."""
     paths = folder(
         log__csv="when,v\n2026-05-31T12:00:00.250Z,1\n2026-05-31T12:00:00.500Z,2\n2026-05-31T12:00:01Z,3\n"
     )
@@ -119,7 +120,7 @@ def test_written_dates_are_times(folder, tmp_path):
 
 
 def test_semicolons_decimal_commas_blanks_and_missing_names(folder, tmp_path):
-    """Tables as spreadsheets, numerical programs and loggers without a heading write them."""
+    """Spreadsheets, numerical programs and loggers without a heading write such tables."""
     semicolons, blanks, bare = folder(
         a__csv="t;v\n0,0;1,5\n0,1;2,5\n",
         b__txt="  t   v\n  0.0 1.5\n  0.1 2.5\n",
@@ -131,7 +132,7 @@ def test_semicolons_decimal_commas_blanks_and_missing_names(folder, tmp_path):
 
 
 def test_nose_up_right_turn_and_dive_in_forward_right_down_axes(folder, tmp_path):
-    """What an aerospace log calls pitching up, turning right, diving and moving right has the other sign here."""
+    """Pitching up, turning right, diving and moving right have the opposite sign in FinsSim's axes."""
     events = {"pitch": 0.1, "yawrate": 0.2, "down": 2.0, "sway": 0.3, "fz": 5.0, "accz": -9.81, "m": 0.4}
     paths = folder(log__csv=table({name: lambda x, v=value: v for name, value in events.items()}))
     trial = one(
@@ -144,7 +145,7 @@ def test_nose_up_right_turn_and_dive_in_forward_right_down_axes(folder, tmp_path
 
 
 def test_world_velocity_becomes_body_velocity(folder, tmp_path):
-    """Sailing north while heading west is moving to the right: v < 0 in axes with y to the left."""
+    """Moving north while heading west is moving to the right: v < 0 in axes with y to the left."""
     paths = folder(
         pose__csv=table(
             {"yaw": lambda x: 90.0, "pitch": lambda x: 0.0, "roll": lambda x: 0.0}, rate=20.0, n=100
@@ -167,14 +168,14 @@ files:
 
 
 def test_pressure_becomes_depth(folder, tmp_path):
-    """One metre of sea water of 1025 kg/m3 is 1025 * 9.80665 Pa."""
+    """One metre of sea water of 1025 kg/m3 gives 1025 * 9.80665 Pa."""
     paths = folder(log__csv=table({"p": lambda x: 1013.25 + 1025 * 9.80665 / 100}))
     text = "time: t\ncolumns: {pressure: {column: p, unit: hPa}}\nsurface_pressure: 101325\nwater: {density: 1025}"
     np.testing.assert_allclose(one(paths, text, tmp_path).channels["depth"], 1.0, rtol=1e-6)
 
 
 def test_streams_of_other_rates_stay_unsynchronised(folder, tmp_path):
-    """The union of the times, NaN where a stream has no sample, and a shift of the clock of one of them."""
+    """Times are the union, with NaN where a stream has no sample, and one stream's clock is shifted."""
     fast, slow = table({"u": np.sin}, rate=50.0, n=200), table({"tau_x": np.cos}, rate=7.0, n=28)
     trial = one(
         folder(fast__csv=fast, slow__csv=slow),
@@ -187,7 +188,7 @@ def test_streams_of_other_rates_stay_unsynchronised(folder, tmp_path):
 
 
 def test_a_cut_table_opens_up_to_the_cut(folder, tmp_path):
-    """The last line ends in the middle of a number: that number is not believed."""
+    """The last line ends within a number, which is discarded."""
     whole = table({"u": lambda x: 10.0 + x})
     (trial,) = read_trials(folder(log__csv=whole[: len(whole) - 4]))
     values = trial.series("u")[1]
@@ -204,7 +205,7 @@ def phased(repeats):
 
 
 def test_splitting_by_phases_gives_one_trial_per_baseline(folder, tmp_path):
-    """Words of the log are translated, and every part starts at 0."""
+    """The log's words are translated, and every part starts at 0."""
     words = "{baseline: baseline, hold: excitation, off: coast}"
     text = f"time: t\nphase: {{column: state, words: {words}}}\ncolumns: {{u: u}}\nsplit: phase"
     map_file = tmp_path / "map.yaml"
@@ -225,7 +226,7 @@ def test_splitting_by_phases_gives_one_trial_per_baseline(folder, tmp_path):
     ],
 )
 def test_splitting_by_gaps_windows_and_a_column(folder, tmp_path, split, names, rows):
-    """A pause of 5 s, two windows, a column that numbers the runs."""
+    """The splits are a pause of 5 s, two windows, and a column that numbers the runs."""
     times = np.concatenate([np.arange(30) * 0.1, 8.0 + np.arange(20) * 0.1])
     text = "t,u,run\n" + "\n".join(f"{t:.1f},1,{int(t > 5)}" for t in times) + "\n"
     map_file = tmp_path / "map.yaml"
@@ -235,7 +236,7 @@ def test_splitting_by_gaps_windows_and_a_column(folder, tmp_path, split, names, 
 
 
 def test_roles_of_single_trials(folder, tmp_path):
-    """The map holds some trials out."""
+    """The map assigns some trials to the held-out role."""
     text = "files:\n  '{trial}.csv': {time: t, columns: {u: u}}\nrole: fit\ntrials: {b: {role: held-out}}"
     map_file = tmp_path / "map.yaml"
     map_file.write_text(text)
@@ -280,7 +281,7 @@ def test_roles_of_single_trials(folder, tmp_path):
     ],
 )
 def test_one_sentence_says_what_is_wrong(folder, tmp_path, text, sentence):
-    """Wrong columns, units, keys: where, what, and what there is."""
+    """Wrong columns, units and keys are named with their location and the valid ones."""
     paths = folder(log__csv="t,vel_x,name\n" + "".join(f"{0.1 * i},{i},x\n" for i in range(30)))
     with pytest.raises(ValueError) as refused:
         one(paths, text, tmp_path)
@@ -295,7 +296,7 @@ def test_clocks_that_do_not_meet_are_refused(folder, tmp_path):
 
 
 def test_a_clock_that_was_set_back_leaves_a_gap_or_is_refused(folder, tmp_path):
-    """Alone, the rest follows behind a gap; among other streams nobody knows where it belongs."""
+    """In a single stream the rest follows after a gap; among several streams its place is ambiguous."""
     back = "t,u\n" + "".join(f"{0.1 * (i % 40):.1f},{i}\n" for i in range(80))
     (trial,) = read_trials(folder(a__csv=back))
     assert (
@@ -309,7 +310,7 @@ def test_a_clock_that_was_set_back_leaves_a_gap_or_is_refused(folder, tmp_path):
 
 
 def test_a_folder_with_other_files_is_not_overwritten(folder, tmp_path):
-    """What somebody keeps under the name of a trial stays."""
+    """Files that a user keeps under the name of a trial are not touched."""
     paths = folder(log__csv=table({"u": np.sin}))
     (tmp_path / "out" / "log").mkdir(parents=True)
     (tmp_path / "out" / "log" / "notes.txt").write_text("mine")
@@ -319,7 +320,7 @@ def test_a_folder_with_other_files_is_not_overwritten(folder, tmp_path):
 
 
 def test_an_earlier_trial_of_the_same_name_is_replaced_with_a_notice(folder, tmp_path, capsys):
-    """The notice is about other data only: the same log may be imported again."""
+    """There is no notice if the data are equal: the same log may be imported again."""
     out = tmp_path / "out"
     for function, replaced in ((np.sin, False), (np.sin, False), (np.cos, True)):
         import_trials(folder(log__csv=table({"u": function})), out=out)
@@ -338,14 +339,14 @@ def test_two_tables_of_one_name_are_refused(tmp_path):
 
 @pytest.mark.parametrize("name", ["hinsdale.yaml", "full.yaml", "dive.yaml", "bag.yaml"])
 def test_the_maps_of_the_page_are_maps(tmp_path, name):
-    """What the page prints can be read."""
+    """Each printed map can be read."""
     (tmp_path / name).write_text(shipped_map(name), encoding="utf-8")
     read_map(tmp_path / name)
 
 
 @pytest.mark.parametrize("name", ["../mine", "..", "/tmp/mine", "a\\\\b", "C:x", ""])
 def test_a_window_of_a_map_names_a_folder_and_no_path(folder, tmp_path, name):
-    """The trial would be written there."""
+    """The trial would be written to that path."""
     map_file = tmp_path / "map.yaml"
     map_file.write_text(f'time: t\ncolumns: {{u: u}}\nsplit: {{windows: {{"{name}": [0, 3]}}}}')
     with pytest.raises(CalibrationError, match="^trial '.*expected the plain name of a file or folder"):
@@ -354,7 +355,7 @@ def test_a_window_of_a_map_names_a_folder_and_no_path(folder, tmp_path, name):
 
 
 def test_a_file_name_makes_no_trial_that_is_a_path(tmp_path):
-    """`...csv` is `..` by the pattern {trial}.csv."""
+    """By the pattern {trial}.csv, `...csv` would be the trial `..`."""
     (tmp_path / "...csv").write_text(table({"u": np.sin}))
     (tmp_path / "map.yaml").write_text("files: {'{trial}.csv': {time: t, columns: {u: u}}}")
     with pytest.raises(CalibrationError, match=r"^trial '\.\.' is a folder's link"):
