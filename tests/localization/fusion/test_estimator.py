@@ -185,6 +185,20 @@ def test_states_follow_the_published_timings(mode, age, mode_then):
     assert health.ready == (mode_then in ("fresh", "coast"))
 
 
+@both
+@pytest.mark.parametrize(("largest", "ready"), [(0.04, False), (0.2, True)])
+def test_a_position_that_is_not_precise_enough_is_not_ready(mode, largest, ready):
+    """After one fix with a standard deviation of 0.3 m, the estimator is ready only if that variance is permitted."""
+    e = estimator(mode, ready_position=largest)
+    e.add(VisionSample(0.0, (1.0, 2.0), 0.1, tuple(map(tuple, np.diag([0.09, 0.09, 4e-4])))))
+    for k in range(3):
+        e.add(ImuSample(0.01 * k, (0.0, 0.0, 0.0), (0.0, 0.0, 9.81), (0.0, 0.0)))
+        e.add(DepthSample(0.01 * k, 0.5))
+    health = e.health(e.estimate(0.02))
+    assert health.initialized and health.vision_mode == "fresh" and health.imu_fresh and health.depth_fresh
+    assert health.ready == ready
+
+
 def test_nothing_is_initialized_before_the_first_fix():
     """Depth and IMU alone give the height but no position, and the estimate reports it."""
     e = estimator()
