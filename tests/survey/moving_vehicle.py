@@ -1,4 +1,4 @@
-"""A vehicle with tags that moves below a camera: what camera, IMU and depth sensor would have measured."""
+"""A vehicle with tags that moves below a camera: simulated measurements of camera, IMU and depth sensor."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ MOUNTS = {
 
 @dataclass
 class Motion:
-    """Truth over time."""
+    """True motion over time."""
 
     t: np.ndarray
     position: np.ndarray
@@ -58,17 +58,17 @@ class Motion:
     """The same motion at other times."""
 
     def depth(self, port=PORT):
-        """Of the port below the surface [m]."""
+        """Return the depth of the port below the surface [m]."""
         return 0.96 - (self.position + quat_rotate(self.quaternion, port))[:, 2]
 
     @property
     def up(self):
-        """In the body."""
+        """Return the up direction in the body."""
         return quat_inverse_rotate(self.quaternion, np.array([0.0, 0.0, 1.0]))
 
 
 def motion(*, tilt=0.2, seconds=60.0, rate=5.0, travel=0.4, spin=0.3, heave=0.15):
-    """A vehicle that wanders, turns and rocks."""
+    """Return the motion of a vehicle that wanders, turns and rocks."""
 
     def at(t):
         roll, pitch = tilt * np.sin(1.3 * t), tilt * np.sin(0.9 * t + 1.0)
@@ -81,7 +81,7 @@ def motion(*, tilt=0.2, seconds=60.0, rate=5.0, travel=0.4, spin=0.3, heave=0.15
 
 
 def moments(moved, rng, *, pixel=0.15, up=0.005, depth=0.004, mounts=None, both=True):
-    """What is measured at every time of a motion."""
+    """Return the measurements at every time of a motion."""
     found = []
     depths, ups = moved.depth(), moved.up
     for i in range(len(moved.t)):

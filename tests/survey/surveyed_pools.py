@@ -1,4 +1,4 @@
-"""Pools and tanks whose every number is known, surveyed with stated errors."""
+"""Pools and tanks with known geometry, surveyed with stated errors."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ TANK = ((-0.3, 0.03, 0.0), (0.3, 0.35, 0.4))
 
 
 def looking(position, target, lens=PLUMB_BOB, up=(0.0, 1.0, 0.0)) -> Camera:
-    """A camera at a place that looks at another."""
+    """Return a camera at a position that points at a target."""
     ahead = np.subtract(target, position) / np.linalg.norm(np.subtract(target, position))
     right = np.cross(ahead, up)
     right = right / np.linalg.norm(right)
@@ -34,7 +34,7 @@ def looking(position, target, lens=PLUMB_BOB, up=(0.0, 1.0, 0.0)) -> Camera:
 
 
 def overhead(lens=PLUMB_BOB) -> Camera:
-    """A camera about 1.2 m above the water, a little askew."""
+    """Return a camera about 1.2 m above the water, slightly tilted."""
     return looking((0.03, -0.17, 2.2), (0.1, -0.1, 0.0), lens)
 
 
@@ -51,7 +51,7 @@ def window() -> Interface:
 
 
 def survey(camera, plane, box, count, seed=0, *, pixel=0.25, error=0.002) -> Observations:
-    """Points drawn in a box that the camera sees, with errors of pixels [px] and of the survey [m]."""
+    """Return points in a box that the camera sees, with errors of pixels [px] and of the survey [m]."""
     rng = np.random.default_rng(seed)
     points = rng.uniform(*np.array(box), (200 * count, 3))
     found = project(camera, plane, points + error * rng.standard_normal(points.shape))
@@ -62,7 +62,7 @@ def survey(camera, plane, box, count, seed=0, *, pixel=0.25, error=0.002) -> Obs
 
 
 def observations(points, pixels) -> Observations:
-    """Single points p0, p1, ..."""
+    """Return single points p0, p1, ..."""
     count = len(points)
     names = tuple(f"p{i}" for i in range(count))
     return Observations(
@@ -78,7 +78,7 @@ def observations(points, pixels) -> Observations:
 
 
 def carried(camera, plane, seen, seed=3):
-    """The same scene written in another frame, turned and far away."""
+    """Return the same scene in another frame, rotated and far away."""
     rng = np.random.default_rng(seed)
     R, t = quat_to_matrix(quat_from_rotvec(2.0 * rng.standard_normal(3))), 5.0 * rng.standard_normal(3)
     normal = R @ plane.normal

@@ -1,4 +1,4 @@
-"""Corners of boards are found where they are, in pixels whose centres have integer coordinates."""
+"""Corners of boards are found accurately, in pixels whose centres have integer coordinates."""
 
 import cv2
 import numpy as np
@@ -13,7 +13,7 @@ H = np.array([[1500.0, 260.0, 120.0], [-180.0, 1420.0, 130.0], [0.35, 0.25, 1.0]
 
 
 def drawn(H, width=640, height=480, columns=9, rows=6, square=0.025, samples=6):
-    """A gray picture of a chessboard: the mean over each pixel, whose centre has integer coordinates."""
+    """Return a gray picture of a chessboard: the mean over each pixel, whose centre has integer coordinates."""
     step = (np.arange(samples) + 0.5) / samples - 0.5
     u = (np.arange(width)[:, None] + step).ravel()
     v = (np.arange(height)[:, None] + step).ravel()
@@ -27,18 +27,18 @@ def drawn(H, width=640, height=480, columns=9, rows=6, square=0.025, samples=6):
 
 
 def at(H, points):
-    """Pixels of board points."""
+    """Return the pixels of board points."""
     seen = np.column_stack([points[:, :2], np.ones(len(points))]) @ H.T
     return seen[:, :2] / seen[:, 2:]
 
 
 def order_free(pixels, expected):
-    """Distance of each found corner to the nearest true one."""
+    """Return the distance of each found corner to the nearest true one."""
     return np.linalg.norm(pixels[:, None] - expected[None], axis=-1).min(axis=1)
 
 
 def test_corners_of_a_chessboard_lie_where_it_was_drawn():
-    """Integer coordinates are pixel centres: half a pixel off would show."""
+    """Integer coordinates are pixel centres: an offset of half a pixel would be detected."""
     pixels, points = see_board(drawn(H), CHESSBOARD)
     expected = at(H, CHESSBOARD.corners)
     assert order_free(pixels, expected).max() < 0.12
@@ -52,14 +52,14 @@ def test_corners_of_a_chessboard_lie_where_it_was_drawn():
 
 
 def test_a_small_board_is_not_pulled_together():
-    """Squares of a dozen pixels keep their corners: the window that refines one holds no other."""
+    """Squares of a dozen pixels keep their corners: the refinement window contains no other corner."""
     small = np.array([[480.0, 30.0, 200.0], [-60.0, 440.0, 160.0], [0.2, 0.5, 1.0]])
     pixels, _ = see_board(drawn(small), CHESSBOARD)
     assert order_free(pixels, at(small, CHESSBOARD.corners)).max() < 0.25
 
 
 def charuco_picture(columns, rows, legacy=False, pixels=60, margin=40, fine=8):
-    """Drawn eight times as large, since OpenCV paints squares a pixel too wide, and averaged."""
+    """Return a board drawn eight times as large, since OpenCV paints squares a pixel too wide, and averaged."""
     board = cv2.aruco.CharucoBoard(
         (columns, rows), 0.04, 0.03, cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
     )

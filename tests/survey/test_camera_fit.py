@@ -1,4 +1,5 @@
-"""Lenses come back from the boards they saw, with intervals that hold, and advice where the boards say too little."""
+"""Lenses are recovered from pictures of boards, with valid intervals, and advice where the boards are
+insufficient."""
 
 from dataclasses import replace
 
@@ -23,7 +24,7 @@ from survey.board_views import LENSES, PHOTOGRAPHS, photographed, views
 @pytest.mark.slow
 @pytest.mark.parametrize("model", COEFFICIENTS)
 def test_a_lens_comes_back_from_its_pictures(model):
-    """Of every model: pixels over the whole picture to a fraction of the noise of a corner."""
+    """For every model, pixels over the whole picture agree to a fraction of a corner's noise."""
     lens = LENSES[model]
     fit = calibrate_camera(views(lens, 20, np.random.default_rng(3)), model=model)
     assert fit.rms == pytest.approx(0.15 * np.sqrt(2.0), rel=0.1)
@@ -39,7 +40,7 @@ def test_a_lens_comes_back_from_its_pictures(model):
 
 @pytest.mark.slow
 def test_intervals_hold_the_truth_nineteen_times_of_twenty():
-    """Over many sets of ten pictures; 4 x 30 intervals, of which 84 % to all must hold."""
+    """Of 4 x 30 intervals over many sets of ten pictures, at least 84 % must contain the truth."""
     lens, inside = LENSES["plumb_bob"], []
     for seed in range(30):
         seen = views(lens, 10, np.random.default_rng(seed))
@@ -103,7 +104,7 @@ def test_published_distortion_bends_pixels_as_ours_where_corners_were_seen():
 
 @pytest.mark.slow
 def test_a_picture_that_disagrees_is_named_and_left_out():
-    """And the lens is that of the others."""
+    """The lens is that of the other pictures."""
     seen = list(views(LENSES["plumb_bob"], 14, np.random.default_rng(1)))
     clean = calibrate_camera(seen[:6] + seen[7:])
     seen[6] = replace(seen[6], pixels=seen[6].pixels + np.random.default_rng(2).normal(0.0, 3.0, (54, 2)))
@@ -114,7 +115,7 @@ def test_a_picture_that_disagrees_is_named_and_left_out():
 
 
 def test_level_boards_do_not_tell_the_focal_length():
-    """Fronto-parallel views: focal length and distance trade against one another, which is said and not guessed."""
+    """In fronto-parallel views focal length and distance are correlated, which is reported."""
     fit = calibrate_camera(views(LENSES["plumb_bob"], 12, np.random.default_rng(0), tilt=0.02))
     assert not fit.estimates["fx"].identifiable
     assert "views_flat" in {one.code for one in fit.findings}

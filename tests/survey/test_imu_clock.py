@@ -1,4 +1,4 @@
-"""The offset between an IMU's clock and the pictures' comes back from turns about the vertical."""
+"""The clock offset between IMU and pictures is recovered from turns about the vertical."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 def recording(rng, late, *, spin=0.3, tilt_noise=0.1, yaw_noise=0.003, uneven=1.0):
-    """Pictures whose tilt is poor and whose heading is good, and the rate about the vertical."""
+    """Return pictures with poor tilt and good heading, and the rate about the vertical."""
 
     def at(t):
         moved = motion(spin=spin).at(t)
@@ -28,7 +28,7 @@ def recording(rng, late, *, spin=0.3, tilt_noise=0.1, yaw_noise=0.003, uneven=1.
 
 @pytest.mark.parametrize("late", [-0.3, 0.0, 0.08])
 def test_the_offset_comes_back_within_its_interval(late):
-    """Though the tilt by the pixels is off by 6 degrees, and the gyro has a bias."""
+    """The tilt from pixels is off by 6 degrees, and the gyro has a bias."""
     t, seen, t_imu, rate = recording(np.random.default_rng(0), late)
     found = imu_clock(t, seen, UP, t_imu, rate)
     assert found.identifiable

@@ -1,4 +1,4 @@
-"""`finssim calibrate mounts`: from a log folder to a vehicle file that holds what the motion tells."""
+"""`finssim calibrate mounts` turns a log folder into a vehicle file with the identifiable mounts."""
 
 import json
 
@@ -63,7 +63,7 @@ def test_tags_are_written_where_they_are(place, capsys):
 
 @pytest.mark.slow
 def test_the_clock_of_the_imu_is_estimated(place, capsys):
-    """50 ms late: in the interval, and the tags where they are all the same."""
+    """50 ms are within the interval, and the tag positions are still right."""
     write_log(place / "late", motion(seconds=30.0), np.random.default_rng(2), clock=0.05)
     after = run(
         place / "late",
@@ -79,7 +79,7 @@ def test_the_clock_of_the_imu_is_estimated(place, capsys):
 
 @pytest.mark.slow
 def test_a_log_without_sensors_places_tags_to_one_another_alone(place, capsys):
-    """Pictures alone: the reference tag keeps the file's mount, and it is said what is missing."""
+    """With pictures alone the reference tag keeps the file's mount, and the missing data are named."""
     folder = write_log(place / "alone", motion(seconds=30.0), np.random.default_rng(3))
     (folder / "imu.csv").unlink()
     (folder / "depth.csv").unlink()
@@ -96,7 +96,7 @@ def test_a_log_without_sensors_places_tags_to_one_another_alone(place, capsys):
 
 
 def test_the_tilt_is_made_where_no_attitude_is_logged(place):
-    """From gyro and accelerometer, within half a degree of the truth once it has settled."""
+    """Computed from gyro and accelerometer, it is within half a degree of the truth once settled."""
     moved = motion()
     folder = write_log(place / "raw", moved, np.random.default_rng(4), attitude=False)
     log = read_mount_log(folder, POOL, load_vehicle(place / "vehicle.yaml"))

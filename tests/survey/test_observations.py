@@ -1,4 +1,4 @@
-"""Pixels find their surveyed points, and what finds none is named."""
+"""Pixels are matched to their surveyed points, and unmatched ones are named."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ def test_pixels_meet_points_by_id(tmp_path):
 
 
 def test_a_point_seen_in_two_pictures_is_one_location(tmp_path):
-    """Its survey has one error, however often it is looked at."""
+    """The survey error of a point is shared by all of its pictures."""
     survey = read_survey(written(tmp_path, "s.csv", "id,x,y,z\na,0,0,0\nb,1,0,0\n"))
     pixels = written(
         tmp_path, "p.csv", "image,id,u,v\n1.png,a,5,6\n2.png,a,5.1,6\n2.png,a,5.1,6\n1.png,b,9,9\n"

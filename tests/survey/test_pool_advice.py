@@ -1,4 +1,4 @@
-"""Poor geometry, wrong rows, tapes and camera files are noticed, and said."""
+"""Poor geometry, wrong rows, tapes and camera files are detected and reported."""
 
 from dataclasses import replace
 
@@ -31,7 +31,7 @@ FIT = ("pose", "height", "tilt", "index")
 
 
 def codes(fit):
-    """Of its findings, the gravest first."""
+    """Return the codes of the findings, the most severe first."""
     return [one.code for one in fit.findings]
 
 
@@ -42,7 +42,7 @@ def tilt_error(fit, plane):
 @pytest.mark.slow
 @pytest.mark.parametrize("box", [FLOOR, SOLID], ids=["floor", "solid"])
 def test_wrong_rows_are_named_and_left_out(box):
-    """Two pairs exchanged and one point 20 cm off: those five and no other."""
+    """With two pairs exchanged and one point 20 cm off, exactly these five are named."""
     seen = survey(overhead(), WATER, box, 40)
     points = seen.points.copy()
     points[[3, 11, 20, 30]] = points[[11, 3, 30, 20]]
@@ -54,7 +54,7 @@ def test_wrong_rows_are_named_and_left_out(box):
 
 @pytest.mark.slow
 def test_a_rough_camera_file_is_found_out():
-    """A focal length 3 % off and no distortion: the lens is fitted here, and said to be."""
+    """With a focal length 3 % off and no distortion, the lens is fitted, and this is reported."""
     rough = Lens(1280, 720, 557.0, 557.0, 640.0, 360.0, "plumb_bob", ())
     seen = survey(overhead(), WATER, SOLID, 80)
     fit = calibrate_pool(seen, rough, PoolFitSettings(water_height=1.0))
@@ -71,7 +71,8 @@ def test_a_good_camera_file_is_left_alone():
 
 
 def test_points_near_the_axis_tell_no_height():
-    """Seen from above, water only brings the floor nearer: the height is said to be unknown, and the map is right."""
+    """Seen from above, water only brings the floor nearer: the height is reported as unknown, and the map is
+    right."""
     seen = survey(overhead(), WATER, ((-0.2, -0.4, 0.0), (0.2, 0.0, 1e-12)), 40)
     fit = calibrate_pool(seen, PLUMB_BOB, PoolFitSettings(fit=FIT))
     assert not fit.estimates["camera_height"].identifiable
@@ -85,7 +86,7 @@ def test_points_near_the_axis_tell_no_height():
 
 @pytest.mark.slow
 def test_a_sloping_floor_taken_for_level_is_noticed():
-    """The water 1.2 degrees from the survey's level: the level is given up, and that is said."""
+    """With the water 1.2 degrees from the survey's level, the level constraint is dropped, which is reported."""
     water = Interface.water(1.0, tilt_x=0.02)
     camera = looking((-2.5, 0.0, 2.5), (0.0, 0.0, 0.0), PLUMB_BOB, (0.0, 0.0, 1.0))
     seen = survey(camera, water, ((-2.0, -1.5, 0.0), (2.0, 1.5, 0.5)), 80, error=0.001)
@@ -152,7 +153,7 @@ def rim(camera, count=8):
 
 @pytest.mark.slow
 def test_marks_above_the_water_are_told_from_wrong_rows():
-    """Eight marks on the rim whose flag was forgotten, and one mark under water that is 20 cm off."""
+    """Eight rim marks lack their flag, and one mark under water is 20 cm off."""
     wet = survey(overhead(), WATER, FLOOR, 40)
     points, pixels = rim(overhead())
     wrong = wet.points.copy()

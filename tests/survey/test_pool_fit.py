@@ -1,4 +1,4 @@
-"""Camera and plane are found from no guess, with intervals that hold the truth, or the refusal says why not."""
+"""Camera and plane are found without a guess, with valid intervals, or refused with the reason."""
 
 from dataclasses import replace
 
@@ -38,7 +38,7 @@ def tilt_error(fit, plane):
 @pytest.mark.parametrize("lens", [PLUMB_BOB, FISHEYE, RATIONAL], ids=lambda lens: lens.model)
 @pytest.mark.parametrize("box", [FLOOR, SOLID], ids=["floor", "solid"])
 def test_noise_free_surveys_give_the_truth(lens, box):
-    """Without errors nothing is left over, whatever the lens, and no guess is needed."""
+    """Without errors the residuals vanish for every lens, and no guess is needed."""
     camera = overhead(lens)
     seen = survey(camera, WATER, box, 40, pixel=0.0, error=0.0)
     fit = calibrate_pool(seen, lens, PoolFitSettings(fit=FIT, index_sigma=0.0, survey_sigma=1e-6))

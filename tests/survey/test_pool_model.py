@@ -1,4 +1,4 @@
-"""The model's derivatives are those of its prediction, and moving it back and forth ends where it began."""
+"""The model's derivatives agree with its prediction, and a step back and forth returns to the start."""
 
 import numpy as np
 import pytest

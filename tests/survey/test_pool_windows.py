@@ -56,7 +56,7 @@ def test_points_behind_a_window(degrees):
 
 @pytest.mark.slow
 def test_a_window_in_the_frame_of_a_target():
-    """Any frame will do: that of a target that lies askew in the water."""
+    """The frame may be that of a tilted target in the water."""
     camera, plane = before_tank(30.0), window()
     camera, plane, seen = carried(camera, plane, survey(camera, plane, TANK, 60, pixel=0.25, error=0.0005))
     told = PoolFitSettings(fit=FIT, window=GLASS, survey_sigma=0.0005)
@@ -145,7 +145,7 @@ def test_rows_before_the_window_do_not_hold_it(turn):
 
 @pytest.mark.slow
 def test_a_plane_at_its_bound_is_told():
-    """A window told far too thick leaves the plane no room before the nearest board."""
+    """A window stated far too thick leaves no room for the plane before the nearest board."""
     camera, plane = before_tank(10.0), turned((12, -9))
     seen = boards(camera, plane, nearest=0.001)
     fit = calibrate_pool(seen, camera.lens, told(window=replace(GLASS, thickness=0.12)))

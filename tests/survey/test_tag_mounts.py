@@ -1,4 +1,4 @@
-"""Mounts come back from a moving vehicle, and what its motion does not tell stays as it was."""
+"""Mounts are recovered from a moving vehicle, and parameters that are not identifiable keep their values."""
 
 from dataclasses import replace
 
@@ -86,7 +86,7 @@ def test_a_rocking_vehicle_tells_its_tags_whole(fitted):
 
 @pytest.mark.slow
 def test_a_level_vehicle_keeps_the_files_heading_and_place():
-    """Without tilt nothing defines the body's axes and origin but the file; relative mounts are told all the same."""
+    """Without tilt only the file defines the body's axes and origin; relative mounts are still identified."""
     fit = fit_mounts(RIG, FILE, moments(motion(tilt=0.0), np.random.default_rng(1)))
     assert set(fit.frozen) == {"reference.turn_z", "reference.x", "reference.y"}
     np.testing.assert_allclose(fit.state.reference.t[:2], FILE[15].t[:2], atol=1e-9)
@@ -99,7 +99,7 @@ def test_a_level_vehicle_keeps_the_files_heading_and_place():
 @pytest.mark.slow
 @pytest.mark.parametrize("quarter", [1, 2])
 def test_a_tag_glued_on_turned_is_found(quarter):
-    """The file's heading of the tag is wrong by quarter turns; the IMU's tilt tells the right one."""
+    """The file's heading of the tag is wrong by quarter turns; the IMU's tilt identifies the right one."""
     wrong = quat_to_matrix(quat_from_euler(0.0, 0.0, quarter * np.pi / 2)) @ LEVEL
     seen = moments(motion(tilt=0.2, seconds=24.0), np.random.default_rng(quarter))
     fit = fit_mounts(RIG, {15: Pose(wrong, FILE[15].t)}, seen)
@@ -110,7 +110,7 @@ def test_a_tag_glued_on_turned_is_found(quarter):
 
 @pytest.mark.slow
 def test_intervals_hold_the_truth():
-    """Three recordings, all that is told; at least 85 % where 95 % are meant."""
+    """For three recordings, at least 85 % of the intervals contain the truth where 95 % are nominal."""
     inside = []
     for seed in range(3):
         seen = moments(motion(tilt=0.2, seconds=20.0), np.random.default_rng(100 + seed))
@@ -121,7 +121,7 @@ def test_intervals_hold_the_truth():
 
 @pytest.mark.slow
 def test_wrongly_read_tags_do_not_pull(rocked):
-    """Pictures in which another thing was read as a tag are left out."""
+    """Pictures in which something else was read as a tag are dropped."""
     rng = np.random.default_rng(0)
     broken = list(rocked[:84])
     for i in range(0, 84, 12):

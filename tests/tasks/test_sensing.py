@@ -1,4 +1,4 @@
-"""What a controller sees with the vehicle's own sensors and position fixes: errors, times, losses, and the filter."""
+"""Observations from the vehicle's own sensors and position fixes: errors, times, losses, and the filter."""
 
 import math
 
@@ -28,11 +28,11 @@ PERFECT_IMU = Imu(
     accel_noise_density=0.0, accel_bias_walk=0.0, accel_bias_initial=0.0,
 )  # fmt: skip
 EXACT = 1e-4
-"""Deviation of a fix that the filter takes as it is [m, rad]."""
+"""Deviation of a fix that the filter adopts exactly [m, rad]."""
 
 
 def carrying(**sensors):
-    """FinsROV with a perfect IMU and other sensors of its own; None takes one off."""
+    """Return FinsROV with a perfect IMU and other sensors; None removes one."""
     vehicle = load_vehicle("finsrov")
     given = {"imu": PERFECT_IMU, "depth": None, "dvl": None, **sensors}
     return vehicle.model_copy(update={"sensors": vehicle.sensors.model_copy(update=given)})
@@ -49,7 +49,8 @@ def fixes(rate=10.0, **noise):
 
 
 def run(env, steps, push=0.4):
-    """Estimates and truth after each step, by name, (steps, worlds, numbers); actions last half a second."""
+    """Return estimates and truth after each step, by name, (steps, worlds, numbers); actions last half a
+    second."""
     rng, rows = np.random.default_rng(0), []
     for k in range(steps):
         if k % 5 == 0:
@@ -63,7 +64,7 @@ def run(env, steps, push=0.4):
 
 
 def yaw_between(q, p):
-    """Of attitude q beyond p [rad], (...)."""
+    """Return the yaw of attitude q relative to p [rad], (...)."""
     d = finssim.core.rotations.quat_multiply(q, p * np.array([-1.0, -1.0, -1.0, 1.0]))
     return 2.0 * np.arctan2(d[..., 2] * np.sign(d[..., 3]), np.abs(d[..., 3]))
 
@@ -72,7 +73,8 @@ def yaw_between(q, p):
 
 
 def test_doubts_grow_and_shrink_as_in_the_filters_of_the_robot():
-    """Position and velocity of `position_filter`, yaw and bias of `attitude` (whose bias has the other sign)."""
+    """Position and velocity of `position_filter`, yaw and bias of `attitude` (whose bias has the opposite
+    sign)."""
     P, q, dt, R = np.array([0.03, 0.01, 0.2]), 0.05, 0.1, 0.004
     square = np.zeros((6, 6))
     square[:3, :3], square[3:, 3:] = np.eye(3) * P[0], np.eye(3) * P[2]
@@ -96,7 +98,7 @@ def test_doubts_grow_and_shrink_as_in_the_filters_of_the_robot():
 
 
 def test_a_late_fix_moves_the_path_since_its_own_time():
-    """With fixes 0.3 s late, what is known of 0.3 s ago is what a filter without the delay knew then."""
+    """With fixes 0.3 s late, the estimate for 0.3 s ago equals that of a filter without delay at that time."""
     at_once, late = (made(fixes(position_std=0.02, delay=delay), worlds=40) for delay in (0.0, 0.3))
     known = run(at_once, 60)["position"]
     run(late, 60)
@@ -106,7 +108,7 @@ def test_a_late_fix_moves_the_path_since_its_own_time():
 
 
 def test_what_is_known_is_as_good_as_the_filter_says():
-    """Motion that is driven as the filter supposes: errors have the variance that it states, over worlds and axes."""
+    """For motion as the filter assumes, errors over worlds and axes have the variance that it states."""
     env = made(fixes(position_std=0.02, yaw_std=0.05), vehicle=carrying(), worlds=400)
     told = env.sensing.estimates.plane.numpy()[0, 0]
     state, rng, dt = env.simulator.state, np.random.default_rng(1), 0.1
@@ -131,7 +133,7 @@ def test_what_is_known_is_as_good_as_the_filter_says():
 
 
 def test_fixes_come_at_their_rate_and_are_lost_as_often_as_their_chance():
-    """At 2.5 Hz every fourth control step may bring one; what comes is where the vehicle is."""
+    """At 2.5 Hz every fourth control step may bring a fix, which is the vehicle's position."""
     env = made(fixes(rate=2.5, dropout=0.3), worlds=400, vehicle=carrying())
     seen = run(env, 40)
     off = np.linalg.norm((seen["position"] - seen["position_true"])[..., :2], axis=2)
@@ -151,7 +153,7 @@ def test_a_fix_is_as_old_as_it_takes_to_come():
 
 @pytest.mark.parametrize("rate", [10.0, 30.0])
 def test_noise_and_offset_of_a_fix_are_those_that_were_given(rate):
-    """Found again from what the filter made of it; of three fixes in a control step the mean counts."""
+    """They are recovered from the filter's estimates; of three fixes in a control step the mean counts."""
     env = made(
         fixes(rate=rate, position_std=0.05, position_bias=0.2, yaw_bias=0.1), worlds=300, vehicle=carrying()
     )
@@ -191,14 +193,14 @@ def test_ranges_draw_the_noise_of_fixes_by_world():
 
 
 def test_depth_comes_from_the_pressure_gauge():
-    """Its turn-on error is what z is off by, whatever fixes say; the plane is not touched."""
+    """The error of z is the gauge's turn-on error, whatever fixes report; x and y are not affected."""
     gauge = DepthSensor(rate=20.0, position=np.array([0.1, 0.0, -0.2]), noise_std=0.0, bias_initial=0.05)
     env = made(fixes(position_bias=1.0), vehicle=carrying(depth=gauge), worlds=400)
     seen = run(env, 20)
     off = (seen["position"] - seen["position_true"])[..., 2]
     assert off[-1].std() == pytest.approx(0.05, rel=0.1)
     left = np.abs(off[-1] + env.sensing.suite.depth.bias.numpy()[:, 0])
-    assert np.quantile(left, 0.95) < 2e-3  # but for those that just hit a wall
+    assert np.quantile(left, 0.95) < 2e-3  # except those that just hit a wall
 
 
 def test_rates_come_from_the_gyro_and_its_bias_is_known_but_for_what_the_filter_doubts():
@@ -214,7 +216,7 @@ def test_rates_come_from_the_gyro_and_its_bias_is_known_but_for_what_the_filter_
 
 
 def test_velocity_comes_from_a_dvl_where_there_is_one():
-    """Without fixes: its noise is filtered, its bias stays and is what the position drifts by."""
+    """Without fixes its noise is filtered, while its bias remains and makes the position drift."""
     quiet = Dvl(rate=10.0, position=np.array([0.0, 0.1, -0.1]), noise_std=0.0)
     seen = run(made(Sensing(rate=0.0), vehicle=carrying(dvl=quiet), worlds=20), 50)
     assert np.abs(seen["position"] - seen["position_true"]).max() < 0.02
@@ -272,7 +274,7 @@ def test_nothing_is_made_where_sensors_are_not_asked_for():
 
 
 def test_fixes_of_another_site_are_a_file(tmp_path):
-    """What is left out of a fix is 0; mistakes are told with file and key."""
+    """Omitted values of a fix are 0; mistakes are reported with file and key."""
     file = tmp_path / "usbl.yaml"
     file.write_text("rate: 1\nfixes: {position_std: 0.2, yaw_std: 1, delay: 0.5}\n")
     env = finssim.make("t1", worlds=1, observe=str(file))

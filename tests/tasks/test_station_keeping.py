@@ -1,4 +1,4 @@
-"""T1 sees, rewards and ends what it says: against NumPy and SciPy, from the truth in the simulator."""
+"""T1's observation, reward and ends are as specified, against NumPy and SciPy, from the true state."""
 
 import math
 from dataclasses import replace
@@ -15,7 +15,7 @@ from finssim.tasks.task import kernels_of, settings_of
 
 TASK = StationKeeping()
 LARGE = RectangularPool(length=20.0, width=20.0, depth=10.0)
-"""Its walls are out of reach, so that the task's own bounds can be left."""
+"""Pool whose walls are out of reach, so that the task's own bounds can be left."""
 SINGLE = 2e-6  # float32, a few operations on numbers of order one
 
 
@@ -24,7 +24,7 @@ def environment(worlds=64, task=TASK, **options):
 
 
 def truth(env):
-    """Position, rotation and velocity of vehicle 0, goal position and goal rotation, by world."""
+    """Return position, rotation and velocity of vehicle 0, goal position and goal rotation, by world."""
     state, a = env.simulator.state, env.arrays
     return (
         state.position.numpy()[:, 0].astype(float),
@@ -36,7 +36,7 @@ def truth(env):
 
 
 def observed(env):
-    """The observation as the facts of the task state it."""
+    """Return the observation as the task specifies it."""
     p, R, nu, goal, R_goal = truth(env)
     offset = R.inv().apply(goal - p)
     relative = (R.inv() * R_goal).as_matrix()
@@ -105,7 +105,7 @@ def test_the_reward_is_the_sum_of_its_terms(seed):
 
 
 def test_resting_at_the_goal_earns_the_most_there_is():
-    """Nothing beats the goal pose at rest without thrust: position + heading weight."""
+    """The maximum is position + heading weight, at rest in the goal pose without thrust."""
     env = environment(1)
     pose = (0.0, 0.0, -0.5), (0.0, 0.0, 0.0, 1.0)
     env.start(*pose, *pose)
@@ -141,7 +141,7 @@ def test_leaving_the_pool_terminates_with_a_loss(position, left):
     ("roll", "low", "high"), [(20, 0, 0), (50, 0.8, 1), (-50, 0.8, 1), (60, 1.2, 1.4), (180, 2, 2)]
 )
 def test_leaning_is_charged_from_half_of_the_tilt_that_a_bridge_stops_at(roll, low, high):
-    """Nothing to 22.5°, 1 at 45°, 2 at 67.5° and beyond; the episode goes on."""
+    """The charge is 0 up to 22.5°, 1 at 45°, 2 from 67.5° on; the episode continues."""
     env = environment(1, auto_reset=False)
     pose = (0.0, 0.0, -0.5), Rotation.from_euler("x", roll, degrees=True).as_quat()
     env.start(*pose, *pose)
@@ -153,7 +153,7 @@ def test_leaning_is_charged_from_half_of_the_tilt_that_a_bridge_stops_at(roll, l
 
 
 def test_the_time_limit_truncates_and_nothing_else_does():
-    """After time_limit / control_step steps, exactly, and as a truncation."""
+    """It happens after exactly time_limit / control_step steps, as a truncation."""
     env = environment(4, replace(TASK, time_limit=1.5))
     pose = (0.0, 0.0, -0.5), (0.0, 0.0, 0.0, 1.0)
     env.start(*pose, *pose)
@@ -165,7 +165,7 @@ def test_the_time_limit_truncates_and_nothing_else_does():
 
 
 def test_leaving_at_the_time_limit_is_a_termination():
-    """Both at once is a failure: nothing may be bootstrapped."""
+    """Both at once count as a failure, so that nothing is bootstrapped."""
     env = environment(1, replace(TASK, time_limit=0.1), auto_reset=False, pool=LARGE)
     env.start((2.6, 0.0, -0.5), (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, -0.5), (0.0, 0.0, 0.0, 1.0))
     step = env.step(np.zeros((1, 6)))
@@ -220,7 +220,7 @@ def test_a_reward_can_be_changed_without_touching_the_shared_one():
 
 
 def test_errors_are_zero_where_the_task_wants_the_vehicle():
-    """At the goal; at a turned and shifted pose they are the offset's parts and the sine of the heading."""
+    """In a rotated and shifted pose they are the components of the offset and the sine of the heading error."""
     env = environment(worlds=2)
     level = np.array([0.0, 0.0, 0.0, 1.0])
     turned = Rotation.from_euler("z", [[0.0], [0.3]]).as_quat()

@@ -1,4 +1,4 @@
-"""The task over a seabed: what is drawn, what the beams see, and the baseline."""
+"""The terrain task: the drawn seabed, the beams' ranges, and the baseline."""
 
 import math
 
@@ -16,18 +16,18 @@ from reference.tails import tailed
 VEHICLE = tailed("cruciform")
 AHEAD_BEAM = math.radians(30.0)
 BARE = VEHICLE.model_copy(update={"perception": {}})
-"""Whose altimeters are single rays from the body origin."""
+"""Vehicle whose altimeters are single rays from the body origin."""
 
 
 def heights(seabed, floor, x, y):
-    """Height of a seabed of waves (height, number, direction, phase) at points [m]."""
+    """Return the height of a seabed of waves (height, number, direction, phase) at points [m]."""
     a, k, direction, phase = np.moveaxis(np.asarray(seabed, float), -1, 0)
     way = np.multiply.outer(x, np.cos(direction)) + np.multiply.outer(y, np.sin(direction))
     return floor + (a * np.sin(k * way + phase)).sum(axis=-1)
 
 
 def seen(env, position, q):
-    """Ranges that a level or tilted vehicle at rest sees [m], (2,)."""
+    """Return the ranges that a level or tilted vehicle at rest measures [m], (2,)."""
     env.simulator.state.position.assign(np.asarray(position, np.float32)[None, None])
     env.simulator.state.quaternion.assign(np.asarray(q, np.float32)[None, None])
     env.simulator.state.velocity.zero_()
@@ -38,7 +38,7 @@ def seen(env, position, q):
 
 
 def echo(beta, height):
-    """Range at which a tenth of the echo of a Ping's pattern from a plane has come, by quadrature [m]."""
+    """Return the range by which a tenth of a Ping's echo from a plane has arrived, by quadrature [m]."""
     width = load_device("ping").beam_width
     u, v = np.meshgrid(*[np.linspace(-width, width, 401)] * 2)
     angle = np.hypot(u, v)
@@ -56,7 +56,8 @@ def echo(beta, height):
     ids=["rays", "ping"],
 )
 def test_beams_over_a_flat_seabed(vehicle, range_of, tolerance, pose):
-    """Of rays the height over the cosine of the angle from the vertical, which a bow up opens; of beams less."""
+    """Rays give height over the cosine of the angle from the vertical, which a raised bow increases; beams
+    give less."""
     env = make("terrain", worlds=1, vehicle=vehicle, seed=1, auto_reset=False)
     env.arrays.seabed.zero_()
     floor = env.task.fit.size * env.task.floor
@@ -118,7 +119,8 @@ def test_the_baseline_keeps_the_altitude(current):
 
 
 def test_the_baseline_takes_ranges_as_the_beams_of_training_give_them():
-    """Its closed form of the echo of a level seabed and the kernel's, on a pitched and rolled vehicle."""
+    """Its closed form for the echo of a level seabed agrees with the kernel's, for a pitched and rolled
+    vehicle."""
     env = make("terrain", worlds=1, vehicle=VEHICLE, seed=1, auto_reset=False)
     env.arrays.seabed.zero_()
     floor = env.task.fit.size * env.task.floor

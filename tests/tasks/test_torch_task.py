@@ -1,4 +1,4 @@
-"""A task in plain torch is the same task: T1 in torch beside T1 in Warp, and all that environments do besides."""
+"""A task in plain torch equals the same task in Warp, for T1 and for all other functions of environments."""
 
 import importlib.util
 import sys
@@ -43,7 +43,7 @@ KeepDepth = example("own/task/keep_depth").KeepDepth
 
 @dataclass(frozen=True, kw_only=True)
 class Herding(TorchTask):
-    """Two agents and one other, with everything that a task may define."""
+    """A task with two agents and one other vehicle that uses everything a task may define."""
 
     agents: ClassVar = ("left", "right")
     others: ClassVar = ("stray",)
@@ -97,9 +97,9 @@ def played(environment, given):
 
 
 def test_t1_in_torch_is_t1():
-    """From equal states along equal actions: equal ends; observations, rewards, measures to a rounding of floats.
+    """Equal states and actions give equal ends; observations, rewards and metrics agree to float rounding.
 
-    With noise, so that what is measured and what is true are told apart; some worlds leave a pool made small.
+    Noise separates measured from true values; some worlds leave a pool made small.
     """
     noise = MeasurementNoise(position_std=0.05, yaw_std=0.1, velocity_std=0.05, position_bias=0.05, delay=0.2)
     limits = {"time_limit": 2.0, "bounds": (1.0, 0.5), "tolerance": 0.6, "yaw_tolerance": 2.0, "hold": 0.5}
@@ -126,12 +126,12 @@ def test_t1_in_torch_is_t1():
 @pytest.mark.slow
 @pytest.mark.parametrize("task", [KeepDepth(), TorchStationKeeping(), Herding()], ids=lambda task: task.name)
 def test_tasks_in_torch_pass_the_check(task):
-    """Equal seeds, any number of worlds, no leak through a reset, bounds, ends, starts, measures."""
+    """The check covers equal seeds, the number of worlds, resets, bounds, ends, starts and metrics."""
     check_task(task)
 
 
 def test_the_check_finds_a_draw_that_knows_nothing_of_the_seed():
-    """`torch.rand` in a task."""
+    """The task calls `torch.rand`."""
 
     @dataclass(frozen=True, kw_only=True)
     class Dicing(KeepDepth):
@@ -143,7 +143,7 @@ def test_the_check_finds_a_draw_that_knows_nothing_of_the_seed():
 
 
 def test_the_number_of_worlds_and_threads_changes_nothing():
-    """Over ends of episodes, several agents, memory and totals."""
+    """This holds across ends of episodes, with several agents, memory and totals."""
     short = replace(Herding(), time_limit=0.5)
     few, many = (finssim.make(short, worlds=n, threads=t, seed=5) for n, t in ((3, 1), (130, 2)))
     given = actions(many, 12)
@@ -154,7 +154,7 @@ def test_the_number_of_worlds_and_threads_changes_nothing():
 
 
 def test_a_saved_state_goes_on_bit_for_bit():
-    """Memory and draws included; everything drawn, measured and delayed."""
+    """Memory and draws are included; everything is drawn, measured and delayed."""
     options = {"worlds": 6, "seed": 4, "randomize": "fossen_learn_to_swim", "observe": "estimator"}
     whole, other = (finssim.make(replace(Herding(), time_limit=0.7), **options) for _ in range(2))
     played(whole, actions(whole, 5))
@@ -180,7 +180,7 @@ def test_a_reset_with_a_seed_starts_over_and_a_mask_leaves_the_others_alone():
 
 
 def test_a_world_that_breaks_ends_alone(tmp_path):
-    """Terminated, without reward, with the last finite observation; the others go on."""
+    """It is terminated without reward, with the last finite observation; the others continue."""
     env = finssim.make(KeepDepth(), worlds=3, seed=1, crash_directory=tmp_path)
     seen = env.reset().copy()
     velocity = env.simulator.state.velocity.numpy().copy()
@@ -197,7 +197,7 @@ def test_a_world_that_breaks_ends_alone(tmp_path):
     ["gymnasium", "sb3", pytest.param("torchrl", marks=pytest.mark.slow), "rsl_rl", "pettingzoo"],
 )
 def test_adapters_take_it_and_their_checkers_pass(library):
-    """As they take any task."""
+    """They accept it like any other task."""
     if library == "gymnasium":
         from gymnasium.utils.env_checker import check_env
 
@@ -232,7 +232,7 @@ def test_adapters_take_it_and_their_checkers_pass(library):
 
 @pytest.mark.slow
 def test_it_is_trained_like_any_task(tmp_path):
-    """A policy directory with the task's name and observation; equal seeds, equal networks."""
+    """The policy directory has the task's name and observation; equal seeds give equal networks."""
     from finssim.control.policy import Policy
     from finssim.learning.train import TrainingSettings, train
 
@@ -268,14 +268,14 @@ def test_it_is_trained_like_any_task(tmp_path):
     ],
 )
 def test_a_wrong_answer_is_named(function, answer, sentence):
-    """Which function, what it gave, what was expected."""
+    """The message gives the function, its answer, and what was expected."""
     wrong = dataclass(frozen=True, kw_only=True)(type("Wrong", (KeepDepth,), {function: answer}))
     with pytest.raises(EnvironmentSetupError, match=sentence):
         finssim.make(wrong(), worlds=2).step(np.zeros((2, 6)))
 
 
 def test_rotations_are_those_of_warp():
-    """And of closed forms: a turn about z is its own heading; all the way round at the ends of the circle."""
+    """They also equal closed forms: a rotation about z has its angle as heading, all round the circle."""
     rng = np.random.default_rng(0)
     q, p = (torch.tensor(x / np.linalg.norm(x, axis=1)[:, None]) for x in rng.normal(size=(2, 50, 4)))
     v = torch.tensor(rng.normal(size=(50, 3)))

@@ -1,4 +1,4 @@
-"""T2 sees, rewards and ends what it says: against NumPy, SciPy and the published observation."""
+"""T2's observation, reward and ends are as specified, against NumPy, SciPy and the published observation."""
 
 import math
 from dataclasses import replace
@@ -17,11 +17,11 @@ from tests.reference.observed import published_t2
 TASK = TrajectoryTracking()
 GUIDES = tuple(TRAJECTORIES.values())
 LARGE = RectangularPool(length=60.0, width=60.0, depth=30.0)
-"""Its walls are out of reach, so that references can be left."""
+"""Pool whose walls are out of reach, so that references can be left."""
 
 
 def following(guides=GUIDES, **changes):
-    """An environment whose worlds follow these guides, and its first observations."""
+    """Return an environment whose worlds follow these guides, and its first observations."""
     longest = max(guide.duration for guide in guides)
     task = replace(TASK, time_limit=longest + 1.0, knot_spacing=0.1)
     env = Environment(task, worlds=len(guides), auto_reset=False, **changes)
@@ -40,7 +40,7 @@ def table(env):
 
 
 def test_the_observation_is_the_published_one():
-    """On every trajectory, at its start, on the way, at its end and beyond: float32 on numbers of order one."""
+    """For every trajectory, at its start, midway, at its end and beyond: float32 on numbers of order one."""
     env, observation = following()
     rng = np.random.default_rng(0)
     for k in range(1375):
@@ -76,7 +76,7 @@ def test_what_cannot_be_followed_is_refused():
 
 
 def test_the_reward_is_the_sum_of_its_terms():
-    """From the state after the step and the reference at that time."""
+    """It uses the state after the step and the reference at that time."""
     r = TASK.reward
     env, _ = following()
     rng = np.random.default_rng(1)
@@ -106,7 +106,7 @@ def test_the_reward_is_the_sum_of_its_terms():
     ],
 )
 def test_getting_lost_terminates_with_a_loss(position, lost):
-    """As published: 4 m off the reference, or 0.3 m above the water."""
+    """The published limits are 4 m off the reference, or 0.3 m above the water."""
     env, _ = following([TRAJECTORIES["straight"]], pool=LARGE)
     place = env.simulator.state.position
     place.assign(np.array([[position]], np.float32))
@@ -139,7 +139,7 @@ def test_references_are_drawn_as_published(level):
 
 
 def test_the_knots_velocity_is_the_derivative_of_their_position():
-    """Between two knots, the cubic's way equals the mean of its ends' velocities up to h² x''' / 12."""
+    """Between two knots, the cubic's displacement is the mean of the end velocities up to h² x''' / 12."""
     env = Environment(TASK, worlds=256)
     position, velocity, _ = table(env)
     h = TASK.knot_spacing
@@ -167,7 +167,7 @@ def test_equal_seeds_draw_equal_references_whatever_the_number_of_worlds():
 
 
 def test_time_within_the_tolerance_is_counted():
-    """At rest at the start of the slow straight line the first two seconds are within 0.05 m, then no more."""
+    """At rest at the start of the slow straight line, only the first two seconds are within 0.05 m."""
     env, _ = following([TRAJECTORIES["straight"]])
     held = []
     for _ in range(60):

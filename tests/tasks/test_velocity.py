@@ -1,4 +1,4 @@
-"""Velocity control: what is commanded, seen and counted, against NumPy and SciPy."""
+"""Velocity control: commands, observations and scoring, against NumPy and SciPy."""
 
 import math
 from dataclasses import replace
@@ -20,20 +20,20 @@ FINSROV = load_vehicle("finsrov")
 
 
 def truth(env):
-    """Attitude, commanded attitude, twist and commanded velocity in the world, by world."""
+    """Return attitude, commanded attitude, twist and commanded velocity in the world, by world."""
     state, a = env.simulator.state, env.arrays
     q, goal = (Rotation.from_quat(x.numpy().reshape(-1, 4)) for x in (state.quaternion, a.goal_quaternion))
     return q, goal, state.velocity.numpy()[:, 0].astype(float), a.target.velocity.numpy().astype(float)
 
 
 def errors(env):
-    """Errors of velocity [m/s] and attitude [rad], by world."""
+    """Return errors of velocity [m/s] and attitude [rad], by world."""
     q, goal, nu, wanted = truth(env)
     return np.linalg.norm(q.apply(nu[:, :3]) - wanted, axis=1), (q.inv() * goal).magnitude()
 
 
 def test_it_sees_what_is_missing_its_own_motion_and_what_is_up():
-    """18 numbers: velocity to gain over 0.2 m/s, two columns of the rotation to the goal, twist within 2, up."""
+    """18 numbers: velocity error over 0.2 m/s, two columns of the rotation to the goal, twist within 2, up."""
     env = Environment(TASK, worlds=32, seed=1)
     for _ in range(20):
         step = env.step(np.random.default_rng(0).uniform(-1.0, 1.0, (32, 6)))
@@ -47,7 +47,8 @@ def test_it_sees_what_is_missing_its_own_motion_and_what_is_up():
 
 
 def test_commands_keep_their_limits_and_their_time():
-    """Speed, tilt and turn from one to the next within their limits, a new one every 5 s but not at the end."""
+    """Speed, tilt and turn between commands are within their limits, with a new one every 5 s but not at the
+    end."""
     env = Environment(TASK, worlds=256, seed=2, auto_reset=False)
     given, headings = [], []
     for _ in range(200):
@@ -67,7 +68,8 @@ def test_commands_keep_their_limits_and_their_time():
 
 
 def test_tilts_are_those_that_half_of_the_moment_holds():
-    """k sin(lean) = limit / 2 on FinsROV's weaker axis; a vehicle with little to right it has the published ones."""
+    """k sin(lean) = limit / 2 on FinsROV's weaker axis; a vehicle with a small righting moment has the
+    published tilts."""
     lean = TASK.fitted([FINSROV]).lean
     stiffness = axis_model(FINSROV).stiffness[3:5]
     assert (stiffness * math.sin(lean) / FINSROV.wrench_limits[3:5]).max() == pytest.approx(0.5)
@@ -91,7 +93,7 @@ def test_the_errors_of_an_episode_are_rms():
 @pytest.mark.slow
 @pytest.mark.parametrize(("vehicle", "observe"), [("finsrov", "estimator"), ("bluerov2_heavy", "truth")])
 def test_the_pid_holds_what_is_commanded(vehicle, observe):
-    """In at least 15 of 16 episodes, level or at 45°."""
+    """It does so in at least 15 of 16 episodes, level or at 45°."""
     env = make("velocity6", worlds=16, vehicle=vehicle, seed=4, observe=observe)
     player = baseline(env.task, "pid", load_vehicle(vehicle))
     memory, observation = player.reset(16), env.reset()
@@ -102,7 +104,7 @@ def test_the_pid_holds_what_is_commanded(vehicle, observe):
 
 
 def test_on_a_robot_the_references_motion_is_the_command():
-    """A policy follows a trajectory by its velocity and heading."""
+    """A policy follows a trajectory by the velocity and heading of the reference."""
     observer, guide = Observer("velocity6", FINSROV), TRAJECTORIES["circle"]
 
     class At:
