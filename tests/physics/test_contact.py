@@ -1,4 +1,4 @@
-"""Walls push, never pull, and take energy out."""
+"""Walls push, never pull, and dissipate energy."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ def wide(x):
 
 @given(penetration=st.floats(1e-6, 0.05), v=velocities, n=normals)
 def test_a_wall_pushes_and_damps(penetration, v, n):
-    """The normal force is at least the spring's, and what is not spring takes power out; friction is at most μ N."""
+    """The normal force is at least the spring's, the remainder dissipates power; friction is at most μ N."""
     force = wide(wall_force(penetration, wp.vec3(*v), wp.vec3(*map(float, n)), WALLS))
     normal = force @ n
     assert normal >= WALLS.stiffness * penetration * (1 - 1e-6)
@@ -36,12 +36,12 @@ def test_a_wall_pushes_and_damps(penetration, v, n):
 
 @given(v=velocities, n=normals, gap=st.floats(0.0, 1.0))
 def test_no_wall_acts_at_a_distance(v, n, gap):
-    """No penetration, no force."""
+    """Without penetration there is no force."""
     assert wide(wall_force(-gap, wp.vec3(*v), wp.vec3(*map(float, n)), WALLS)).tolist() == [0.0, 0.0, 0.0]
 
 
 def corner_wrench(position, q, nu):
-    """The sum over corners and walls, written out in the world frame, float64."""
+    """Return the sum over corners and walls, written out in the world frame in float64."""
     R = rotation(q)
     total = np.zeros(6)
     planes = [((0, 0, 1), -1.0), ((-1, 0, 0), -2.0), ((1, 0, 0), -2.0), ((0, -1, 0), -1.0), ((0, 1, 0), -1.0)]
@@ -74,7 +74,7 @@ def test_contact_is_the_sum_over_corners_and_walls():
 
 
 def test_pools_that_cannot_be_are_refused():
-    """No size, or walls that pull."""
+    """A pool without size and walls that pull are refused."""
     with pytest.raises(SurroundingsError, match="pool: length, width and depth must exceed 0 m"):
         RectangularPool(depth=0.0)
     with pytest.raises(SurroundingsError, match="pool: wall coefficients must not be negative"):

@@ -1,4 +1,4 @@
-"""Damping takes power out, whatever the point where its coefficients hold."""
+"""Damping dissipates power, whatever the reference point of its coefficients."""
 
 import numpy as np
 import pytest
@@ -31,7 +31,7 @@ def matrices(name, model):
 
 
 def total_damping(nu_r, D1, D2, Du):
-    """All of paper, eq. 2."""
+    """Return the damping wrench of eq. 2 of the paper."""
     return damping_wrench(nu_r, D1, D2) + surge_coupled_wrench(nu_r, Du)
 
 

@@ -33,7 +33,7 @@ TOGETHER = pytest.mark.parametrize(
 
 
 def wrench(vehicle, nu, values):
-    """Wrench of the actuators: M times what they add to the acceleration, (n, 6) [N, N m]."""
+    """Return the wrench of the actuators: M times the acceleration that they add, (n, 6) [N, N m]."""
     zero = np.zeros(len(vehicle.channel_names))
     gained = fs.acceleration(vehicle, DEEP, nu, actuators=values) - fs.acceleration(
         hull({}), DEEP, nu, actuators=zero[:1]
@@ -43,14 +43,14 @@ def wrench(vehicle, nu, values):
 
 @EVERY
 def test_at_its_rest_value_it_only_feels_the_flow(name):
-    """Value 0 at rest in the water: nothing."""
+    """At value 0, at rest in the water, it exerts no wrench."""
     vehicle = hull({name: SECTIONS[name]})
     np.testing.assert_allclose(wrench(vehicle, np.zeros(6), [0.0, 0.0]), 0.0, atol=2e-4)
 
 
 @EVERY
 def test_its_force_at_rest_does_no_work_on_a_vehicle_that_stands(name):
-    """Without a flow and without thrust a fin, a gimbal and a brake give nothing at any value."""
+    """Without flow and thrust a fin, a gimbal and a brake exert no wrench at any value."""
     vehicle = hull({name: SECTIONS[name]})
     tau = wrench(vehicle, np.zeros(6), [0.0, vehicle.actuators[name].maximum])
     active = name in ("buoyancy", "moving_mass")
@@ -59,7 +59,8 @@ def test_its_force_at_rest_does_no_work_on_a_vehicle_that_stands(name):
 
 @TOGETHER
 def test_a_step_follows_lag_rate_and_travel(names):
-    """Commanded beyond its travel: it moves at its rate, by its lag, and stops at its end; equal in all worlds."""
+    """Commanded beyond its travel, it moves at its rate, then by its lag, and stops at its end; equal in all
+    worlds."""
     sections = {
         name: {**SECTIONS[name], "time_constant": 0.2, "rate_limit": 2.0 * SECTIONS[name]["maximum"]}
         for name in names
@@ -77,7 +78,7 @@ def test_a_step_follows_lag_rate_and_travel(names):
     np.testing.assert_allclose(x[-1], 1.0, rtol=1e-5)
     rate = np.diff(np.vstack([np.zeros_like(x[:1]), x]), axis=0) / 0.05
     assert rate.max() <= 2.0 * (1.0 + 1e-4)
-    # At the rate until the way left is the rate times the time constant, then the lag.
+    # It moves at its rate until the remaining travel is rate times time constant, then by the lag.
     t = 0.05 * np.arange(1, 61)
     lag = 1.0 - 0.4 * np.exp(-(t - 0.3) / 0.2)
     expected = np.where(t <= 0.3, np.minimum(2.0 * t, 1.0), lag)
@@ -86,7 +87,8 @@ def test_a_step_follows_lag_rate_and_travel(names):
 
 @TOGETHER
 def test_play_keeps_it_from_the_command(names):
-    """It stays while the command is within its play, and then stops short of it by as much, from both sides."""
+    """It does not move while the command is within its play, and stops short of it by the play, from both
+    sides."""
     ends = np.array([SECTIONS[name]["maximum"] for name in names])
     sections = {name: {**SECTIONS[name], "play": 0.1 * SECTIONS[name]["maximum"]} for name in names}
     sim = fs.Simulator(hull(sections), control_step=0.05)
@@ -100,7 +102,7 @@ def test_play_keeps_it_from_the_command(names):
 
 @TOGETHER
 def test_vehicles_with_and_without_it_share_a_simulation(names):
-    """Beside one with the actuators, a vehicle without them moves as it does alone."""
+    """A vehicle without the actuators moves beside one with them exactly as it does alone."""
     plain, fitted = hull({}), hull({name: SECTIONS[name] for name in names})
     ends = []
     for crew in ([plain], [fitted, plain]):
@@ -115,7 +117,8 @@ def test_vehicles_with_and_without_it_share_a_simulation(names):
 @TOGETHER
 @pytest.mark.slow
 def test_both_integrators_agree(names):
-    """`rk4`, one world at a time, and `midpoint`, eight worlds together, on a manoeuvre of 5 s with each alone."""
+    """`rk4`, one world at a time, and `midpoint`, eight worlds together, agree on a manoeuvre of 5 s with
+    each alone."""
     vehicle, found = hull({name: SECTIONS[name] for name in names}), []
     commands = np.diag([0.5 * SECTIONS[name]["maximum"] for name in names])
     for integrator in ("rk4", "midpoint"):
@@ -137,7 +140,7 @@ def fin(**changes):
 
 @pytest.mark.parametrize("alpha", [0.02, 0.25, -0.29])
 def test_lift_and_drag_of_a_fin_are_the_closed_forms(alpha):
-    """Going straight: L = ½ρ A a α U² to the side of the leading edge, D = ½ρ A (d0 + d1 |α| + d2 α²) U²."""
+    """Straight ahead, L = ½ρ A a α U² to the side of the leading edge, D = ½ρ A (d0 + d1 |α| + d2 α²) U²."""
     U = 1.7
     q = 0.5 * RHO * 0.02 * U**2
     tau = wrench(fin(), [U, 0, 0, 0, 0, 0], [0.0, alpha])
@@ -146,7 +149,7 @@ def test_lift_and_drag_of_a_fin_are_the_closed_forms(alpha):
 
 
 def test_its_slope_is_its_derivative():
-    """Around zero deflection dY/dδ = ½ρ A a U², and so falls -Y with the sideways speed, by ½ρ A (a + d0) U."""
+    """Around zero deflection dY/dδ = ½ρ A a U²; -Y falls with the sideways speed by ½ρ A (a + d0) U."""
     U, h = 2.0, 1e-2
     ends = [wrench(fin(), [U, 0, 0, 0, 0, 0], [0.0, s * h])[1] for s in (1.0, -1.0)]
     np.testing.assert_allclose((ends[0] - ends[1]) / (2 * h), 0.5 * RHO * 0.02 * 3.0 * U**2, rtol=2e-3)
@@ -155,7 +158,7 @@ def test_its_slope_is_its_derivative():
 
 
 def test_a_fin_takes_energy_out_whatever_the_flow():
-    """At any deflection and velocity, turning too: nu · tau <= 0, for lift does no work and drag takes it."""
+    """At any deflection and velocity, also in turns, nu · tau <= 0: lift does no work and drag dissipates."""
     nu = RNG.uniform(-2.0, 2.0, (200, 6))
     values = np.column_stack([np.zeros(200), RNG.uniform(-0.5, 0.5, 200)])
     power = (nu * wrench(fin(), nu, values)).sum(1)
@@ -170,7 +173,7 @@ def test_a_fin_is_symmetric():
 
 
 def test_beyond_the_stall_lift_falls_to_nothing_at_a_right_angle():
-    """Moving sideways alone the fin is a plate: drag as its coefficient's limit says, and no lift."""
+    """In purely sideways motion the fin is a plate: drag at its coefficient's limit, and no lift."""
     V = 1.5
     tau = wrench(fin(), [0, V, 0, 0, 0, 0], [0.0, 0.0])
     np.testing.assert_allclose(tau[:2], [0.0, -0.5 * RHO * 0.02 * DRAG_MAX * V**2], atol=1e-2)
@@ -183,14 +186,14 @@ def test_beyond_the_stall_lift_falls_to_nothing_at_a_right_angle():
 
 
 def test_without_incidence_only_the_deflection_counts():
-    """`incidence: 0`: sideways motion adds to the speed and not to the angle."""
+    """`incidence: 0`: sideways motion contributes to the speed but not to the angle."""
     tau = wrench(fin(incidence=0.0), [1.2, 0.5, 0, 0, 0, 0], [0.0, 0.1])
     q = 0.5 * RHO * 0.02 * (1.2**2 + 0.5**2)
     np.testing.assert_allclose(tau[:2], [-q * (0.01 + 0.002 + 0.011), q * 0.3], atol=4e-3)
 
 
 def test_a_propeller_s_wake_makes_a_fin_work_at_rest():
-    """V² = 2 k T / (ρ A_disc) where the vehicle stands: lift at the bollard (momentum theory)."""
+    """V² = 2 k T / (ρ A_disc) at zero speed gives lift at bollard pull (momentum theory)."""
     T, k = 20.0, 0.6
     vehicle = hull({"fin": {**FIN, "wake": {"propeller": k}}})
     gained = wrench(vehicle, np.zeros(6), [T, 0.2])
@@ -199,7 +202,7 @@ def test_a_propeller_s_wake_makes_a_fin_work_at_rest():
 
 
 def test_a_current_is_part_of_the_flow():
-    """At rest in water that moves aft, a fin steers as it does ahead in still water."""
+    """At rest in water that moves aft, a fin steers as in motion ahead through still water."""
     found = []
     for water, speed in ((None, 1.0), (Water(current=(-1.0, 0.0, 0.0)), 0.0)):
         sim = fs.Simulator(fin(), control_step=0.01, substeps=1, water=water, water_moves=True)
@@ -231,7 +234,7 @@ def test_thrust_and_torque_fall_with_the_inflow():
 
 
 def test_the_inflow_takes_energy_out():
-    """Its part of the thrust works against the motion, ahead and astern, for either direction of rotation."""
+    """Its part of the thrust opposes the motion, ahead and astern, for either direction of rotation."""
     nu = RNG.uniform(-2.0, 2.0, (100, 6))
     values = RNG.uniform(-40.0, 40.0, (100, 1))
     without = wrench(hull({}), nu, values)
@@ -245,14 +248,15 @@ def test_the_inflow_takes_energy_out():
 
 
 def test_a_buoyancy_engine_lifts_and_pitches():
-    """ρ g V upwards at its place."""
+    """The force is ρ g V upwards at its position."""
     tau = wrench(hull({"tank": SECTIONS["buoyancy"]}), np.zeros(6), [0.0, 5e-4])
     F = RHO * G * 5e-4
     np.testing.assert_allclose(tau, [0, 0, F, 0, -0.4 * F, 0], atol=1e-3)
 
 
 def test_a_moved_mass_moves_centre_and_inertia():
-    """With the mass at r + δ the vehicle accelerates like one whose body has that centre and inertia."""
+    """With the mass at r + δ the vehicle accelerates like one whose body has the resulting centre and
+    inertia."""
     delta, m, p = 0.15, 4.0, np.array([0.1, 0.0, -0.05])
     vehicle, nu = hull({"battery": SECTIONS["moving_mass"]}), [1.0, 0.2, -0.1, 0.1, 0.3, -0.2]
     r_g, M = vehicle.body.center_of_gravity, vehicle.body.mass
@@ -270,7 +274,8 @@ def test_a_moved_mass_moves_centre_and_inertia():
 
 
 def weightless(**changes):
-    """A hull with a moving mass of 4 kg, without gravity and drag: impulse is conserved, that of the water included."""
+    """Return a hull with a moving mass of 4 kg, without gravity and drag: impulse including the water's is
+    conserved."""
     none = dict.fromkeys(("linear_damping", "quadratic_damping"), [0.0] * 6)
     vehicle = hull({"battery": {**SECTIONS["moving_mass"], "rate_limit": 0.05, **changes}})
     return vehicle.replace(
@@ -279,7 +284,8 @@ def weightless(**changes):
 
 
 def impulse(vehicle, sim, delta):
-    """Linear and angular impulse about the world's origin of a hull whose mass is at rest in it [N s, N m s], (6,)."""
+    """Return the linear and angular impulse about the world's origin of a hull with its mass at rest [N s, N
+    m s], (6,)."""
     section, body = vehicle.actuators["battery"], vehicle.body
     r_g, M, m, p = np.array(body.center_of_gravity), body.mass, section.mass, np.array(section.position)
     r = p + delta * np.array(section.axis)
@@ -298,7 +304,8 @@ def impulse(vehicle, sim, delta):
 
 @pytest.mark.slow
 def test_the_hull_recoils_from_a_moved_mass_and_keeps_its_impulse():
-    """At rest it yields by m δ / (M + added mass); tumbling, it keeps its impulse (2.4 % were lost without recoil)."""
+    """At rest it recoils by m δ / (M + added mass); tumbling, it keeps its impulse (2.4 % were lost without
+    recoil)."""
     still = weightless(position=[0.1, 0.0, 0.0]).replace({"body.center_of_gravity": [0.0, 0.0, 0.0]})
     tumbling = weightless()
     for vehicle, nu in ((still, np.zeros(6)), (tumbling, np.array([0.3, -0.2, 0.1, 0.3, -0.2, 0.4]))):
@@ -318,14 +325,15 @@ def test_the_hull_recoils_from_a_moved_mass_and_keeps_its_impulse():
 
 
 def test_a_gimbal_turns_the_thrust():
-    """T (cos δ, sin δ, 0) at the disc."""
+    """The thrust is T (cos δ, sin δ, 0) at the disc."""
     T, d = 30.0, 0.3
     tau = wrench(hull({"nozzle": SECTIONS["gimbal"]}), np.zeros(6), [T, d])
     np.testing.assert_allclose(tau, [T * np.cos(d), T * np.sin(d), 0, 0, 0, -0.7 * T * np.sin(d)], atol=2e-3)
 
 
 def test_a_fins_slope_is_twice_its_damping_ahead():
-    """-d tau_i/d nu_i of each axis alone by central differences of the wrench, straight ahead at 2 m/s: half of it."""
+    """-d tau_i/d nu_i of each axis alone, by central differences straight ahead at 2 m/s, is half of the
+    slope."""
     fin = {**FIN, "drag": [0.02, 0.0, 0.0], "incidence": 0.8}
     vehicle = hull({"rudder": fin})
     items = {item: section for item, section in installed(vehicle).items() if item.kind.name == "fin"}
@@ -366,7 +374,7 @@ def test_a_fins_slope_is_twice_its_damping_ahead():
     ],
 )
 def test_a_section_that_cannot_be_is_refused(tmp_path, section, words):
-    """One sentence that names file, actuator and key."""
+    """The refusal is one sentence that names file, actuator and key."""
     import yaml
 
     file = tmp_path / "rov.yaml"
@@ -382,7 +390,7 @@ def test_a_section_that_cannot_be_is_refused(tmp_path, section, words):
 
 
 def test_actuators_are_part_of_the_file_and_of_its_digest():
-    """What is read is written again and read as the same; another area is another vehicle."""
+    """A file survives reading and writing; another area makes another vehicle."""
     vehicle = fin()
     again = type(vehicle)(**vehicle.values(), name="hull")
     assert again.sha256 == vehicle.sha256 and again.values() == vehicle.values()
@@ -391,7 +399,7 @@ def test_actuators_are_part_of_the_file_and_of_its_digest():
 
 
 def test_commands_keep_to_channels():
-    """Thrust commands leave the other actuators where they are; too many channels are refused."""
+    """Thrust commands do not move the other actuators; too many channels are refused."""
     sim = fs.Simulator("lauv", worlds=2)
     sim.set_actuators([5.0, *[0.1] * 4])
     sim.set_thrust([10.0])
@@ -403,7 +411,8 @@ def test_commands_keep_to_channels():
 
 
 def test_top_speed_counts_the_inflow():
-    """In the simulation at full thrust a propeller that loses thrust reaches the speed that `terminal_speeds` says."""
+    """At full simulated thrust a propeller that loses thrust with inflow reaches the speed of
+    `terminal_speeds`."""
     vehicle = hull({}, propeller={"inflow": {"thrust_loss": 0.02, "wake_fraction": 0.2}})
     stable = {"hydrodynamics.calibrated.added_mass": [1.0, 1.0, 1.0, 0.1, 4.0, 4.0]}  # no Munk moment
     level = vehicle.replace({"body.center_of_gravity": [0.0, 0.0, -0.02], **stable})
@@ -418,7 +427,7 @@ def test_top_speed_counts_the_inflow():
 
 
 def test_ranges_draw_the_parameters_of_all_fins():
-    """`fin: {lift_slope: ...}` scales the fins of a world alike; a scale of thrust leaves angles alone."""
+    """`fin: {lift_slope: ...}` scales all fins of a world equally; a scale of thrust does not change angles."""
     vehicle = fs.load_vehicle("lauv").replace(
         {"actuators.fin_starboard.lift_slope": 2.0}
     )  # the others have 3

@@ -1,4 +1,4 @@
-"""Laws that every hydrodynamic term obeys: those of the package, of installed packages, and that of an example."""
+"""Laws that every hydrodynamic term obeys: those of the package, of installed packages, and of an example."""
 # mypy: disable-error-code="valid-type,misc,index,no-any-return,no-untyped-def,untyped-decorator"
 
 import numpy as np
@@ -27,7 +27,7 @@ def term(name):
 
 
 def drawn(term, diagonal=False):
-    """Path of each parameter -> positive numbers, or a matrix whose symmetric part is positive definite.
+    """Return path of each parameter -> positive numbers, or a matrix whose symmetric part is positive definite.
 
     Lengths are those of a vehicle.
     """
@@ -48,7 +48,7 @@ def drawn(term, diagonal=False):
 
 
 def evaluated(term, role, numbers, nu):
-    """Wrench or slope at velocities, (n, 6)."""
+    """Return wrench or slope at velocities, (n, 6)."""
     function = composed((term,), role)
 
     @wp.kernel(enable_backward=False, module="unique")
@@ -67,20 +67,20 @@ def evaluated(term, role, numbers, nu):
 
 
 def value_of(term, numbers):
-    """What stands under the key of a vehicle file."""
+    """Return the value of the term's key in a vehicle file."""
     plain = {path: np.asarray(number).tolist() for path, number in numbers.items()}
     return plain[term.name] if term.name in plain else {p.partition(".")[2]: x for p, x in plain.items()}
 
 
 @EVERY
 def test_at_rest_it_gives_nothing(term):
-    """A velocity of zero, any parameters: no wrench."""
+    """At zero velocity, with any parameters, there is no wrench."""
     assert not evaluated(term, "wrench", drawn(term), np.zeros((1, 6))).any()
 
 
 @EVERY
 def test_a_damping_term_takes_energy_out(term):
-    """nu_r · tau <= 0, of a term that declares how fast its wrench falls with the velocity."""
+    """nu_r · tau <= 0 for a term that declares the slope of its wrench by velocity."""
     if term.slope is None:
         pytest.skip(f"{term.name} declares no slope: it is no damping")
     for _ in range(4):
@@ -116,7 +116,7 @@ def test_its_slope_is_its_derivative(term):
 
 @EVERY
 def test_its_declared_share_of_quadratic_drag_is_its_drag(term):
-    """Moving along one axis alone, either way: -tau_i = d2_i v|v|."""
+    """For motion along one axis alone, in either direction, -tau_i = d2_i v|v|."""
     numbers = drawn(term)
     d2 = term.quadratic(term.read(value_of(term, numbers)))
     for v in (-1.5, 0.5, 2.0):
@@ -126,9 +126,9 @@ def test_its_declared_share_of_quadratic_drag_is_its_drag(term):
 
 
 def test_the_simulator_accelerates_by_the_wrench_of_each():
-    """M (nu' - nu0') = tau, where nu0' is that without the term; one step of 50 µs, short beside 1 / 160 s.
+    """M (nu' - nu0') = tau, where nu0' is without the term; one step of 50 µs, short compared with 1 / 160 s.
 
-    One vehicle for each term, in a world whose kernel has them all.
+    There is one vehicle for each term, in a world whose kernel has them all.
     """
     TERMS[WING.name] = WING
     terms = [TERMS[name] for name in NAMES]

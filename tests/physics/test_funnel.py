@@ -28,7 +28,7 @@ def depths(funnel: Funnel, x: wp.array(dtype=wp.vec3), out: wp.array(dtype=wp.ve
 
 
 def found(points):
-    """Normals and depths of points in dock axes, (n, 3) and (n,)."""
+    """Return normals and depths of points in dock axes, (n, 3) and (n,)."""
     x = wp.array(np.asarray(points, np.float32), dtype=wp.vec3, device="cpu")
     out = wp.zeros(len(points), dtype=wp.vec4, device="cpu")
     wp.launch(depths, len(points), [DOCK.struct(1, 1, wp.get_device("cpu")), x, out], device="cpu")
@@ -40,7 +40,7 @@ def sample(n=20000):
 
 
 def test_a_point_is_as_deep_as_it_is_far_from_the_surface():
-    """Inside the block: the distance to the nearest of its faces; outside and in the bore: nothing."""
+    """Inside the block depth is the distance to the nearest face; outside and in the bore it is zero."""
     points = sample()
     expected = depth_in(DOCK, points.astype(float))
     assert 0.2 < np.mean(expected > 0.0) < 0.8
@@ -48,7 +48,7 @@ def test_a_point_is_as_deep_as_it_is_far_from_the_surface():
 
 
 def test_the_normal_leads_out():
-    """A unit vector; along it, by the depth, lies the surface."""
+    """It is a unit vector, and the surface lies along it at the depth."""
     points = sample()
     n, depth = found(points)
     inside = depth > 1e-4
@@ -60,7 +60,7 @@ def test_the_normal_leads_out():
 
 @pytest.mark.parametrize("turn", [0.3, 1.7, 4.0])
 def test_the_surface_is_one_of_revolution(turn):
-    """Turned about the axis, points are as deep and normals turn along."""
+    """Rotating a point about the axis keeps its depth and rotates its normal."""
     points = sample(500)
     c, s = np.cos(turn), np.sin(turn)
     R = np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
@@ -79,7 +79,7 @@ def test_the_hull_has_a_nose_and_twenty_corners():
 
 
 def test_the_section_is_the_one_described():
-    """The reference's own corners: mouth, throat, end, and a rim around them."""
+    """Its corners are those of the reference: mouth, throat, end, and a rim around them."""
     assert section(DOCK)[:, 0].max() == DOCK.tube_length + BACK and section(DOCK)[:, 1].max() == OUTER
 
 

@@ -1,4 +1,5 @@
-"""Closed forms of the terms of slender hulls: cross-flow drag, lift and drag, and what the wake takes from C_A."""
+"""Closed forms of the terms of slender hulls: cross-flow drag, lift and drag, and the relief of C_A by the
+wake."""
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ WING = {"drag": 6.1, "lift": 29.0, "induced": 21.0}
 
 
 def wrenches(name, numbers, nu=NU):
-    """Wrench of one term at velocities, (n, 6)."""
+    """Return the wrench of one term at velocities, (n, 6)."""
     term = TERMS[name]
     row = parameter_row((term,), {f"{name}.{k}" if k else name: x for k, x in numbers.items()})
     return term_wrenches((term,), [row], nu, [[0.0, 0.0, 1.0]] * len(nu), 5.0, 1000.0)[:, 0]
@@ -36,7 +37,7 @@ def test_cross_flow_drag_is_the_integral_over_strips():
 
 
 def test_drag_is_against_the_flow_and_lift_across_it():
-    """In the plane of surge and heave: its parts by the angle of attack, at all angles; from the side neither."""
+    """In surge and heave both follow the angle of attack, at all angles; in sway alone there is neither."""
     found = wrenches("lift_drag", WING)
     alpha, speed = np.arctan2(NU[:, 2], NU[:, 0]), np.linalg.norm(NU[:, :3], axis=1)
     flow = np.stack([np.cos(alpha), np.sin(alpha)], axis=1)
@@ -52,7 +53,7 @@ def test_drag_is_against_the_flow_and_lift_across_it():
 
 
 def test_relief_cancels_the_products_that_fossens_torpedo_leaves_out():
-    """-C_A nu with it is that of C_A with entries of C_A set to 0, and its power is nil."""
+    """With it -C_A nu is that of a C_A with some entries set to 0, and its power is zero."""
     A = np.array([1.0, 30.0, 28.0])
     found = wrenches("munk_relief", {"": A})
     for nu, tau in zip(NU, found, strict=True):

@@ -1,4 +1,4 @@
-"""Blocks of worlds compute what the kernel for one world computes, and no world notices who shares its block."""
+"""Blocks of worlds compute the same as the kernel for one world, and worlds of a block are independent."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ from reference.cases import PAIRS, random_states
 CASES = [
     (name, model) for name, model in PAIRS if (model != "mesh" or name == "finsrov") and name != "slocum"
 ]
-"""Vehicles with the models that a trace can follow, one of them with a mesh; a moving mass is none of it."""
+"""Vehicles with the models that can be traced, one of them with a mesh; a moving mass cannot be."""
 STEPS = 25
 FIELDS = ("position", "quaternion", "velocity", "acceleration", "actuator", "thrust")
 """The whole state of a world."""
@@ -44,7 +44,7 @@ def simulate(
 
 
 def numbers(sim, world=slice(None)):
-    """All of the state, a row for each world."""
+    """Return the whole state, one row for each world."""
     return np.concatenate([sim.numpy(f)[world].reshape(len(sim.numpy(f)[world]), -1) for f in FIELDS], axis=1)
 
 
@@ -68,7 +68,7 @@ def test_blocks_compute_what_single_worlds_do(monkeypatch, name, model):
 
 
 def test_several_vehicles_a_pool_and_tethers_go_in_blocks_too(monkeypatch):
-    """Two in a world, walls that are not touched, and lines."""
+    """Two vehicles in a world, walls that are not touched, and lines."""
     options = {"pool": RectangularPool(length=40.0, width=40.0, depth=12.0), "tether": TetherLine()}
     blocks, single = (
         simulate(monkeypatch, ["finsrov", "finsrov"], lanes=lanes, **options) for lanes in (True, False)
@@ -77,7 +77,7 @@ def test_several_vehicles_a_pool_and_tethers_go_in_blocks_too(monkeypatch):
 
 
 def test_every_world_has_its_own_parameters(monkeypatch):
-    """Where they differ, they are read by world."""
+    """Parameters that differ are read by world."""
 
     def heavier(sim):
         sim.plant.mass.assign(sim.plant.mass.numpy() * np.linspace(0.9, 1.1, sim.worlds)[:, None])
@@ -100,7 +100,8 @@ ODD = {
 
 @pytest.mark.parametrize("where", ODD)
 def test_a_world_that_goes_another_way_than_its_block_disturbs_nobody(monkeypatch, where):
-    """Its neighbours are bit by bit as they are beside a quiet one; it is as without blocks, to rounding."""
+    """Its neighbours are bit-identical to those beside a quiet world; it equals the run without blocks, to
+    rounding."""
     position, twist = ODD[where]
     quiet = random_states(np.random.default_rng(5), LANES, depth=(-6.0, -4.0), speed=0.3, turn=0.3)
     odd = [x.copy() for x in quiet]
@@ -138,7 +139,7 @@ def test_blocks_touch_walls_and_come_to_the_surface_as_single_worlds_do(monkeypa
 
 
 def test_a_world_does_not_depend_on_its_place_in_a_block(monkeypatch):
-    """Bit by bit: 1, 5 and 19 worlds, and any cut into slices."""
+    """Results are bit-identical for 1, 5 and 19 worlds, and for any cut into slices."""
     runs = [simulate(monkeypatch, "finsrov", worlds=19)]
     states = [
         x.copy() for x in random_states(np.random.default_rng(4), 19, depth=(-6.0, -4.0), speed=0.5, turn=0.5)
