@@ -327,6 +327,15 @@ def test_an_earlier_trial_of_the_same_name_is_replaced_with_a_notice(folder, tmp
         assert ("log: replaced an earlier trial with other data" in capsys.readouterr().err) == replaced
 
 
+@pytest.mark.parametrize(("factor", "reported"), [(1.0, False), (57.3, True)])
+def test_angles_that_are_impossible_in_radians_are_reported_at_the_import(
+    folder, tmp_path, capsys, factor, reported
+):
+    """A roll of 29 in a column without a unit can only be in degrees."""
+    import_trials(folder(log__csv=table({"roll": lambda t: 0.5 * factor * np.sin(t)})), out=tmp_path / "out")
+    assert ("log: roll reaches 28.6 rad: degrees?" in capsys.readouterr().err) == reported
+
+
 def test_two_tables_of_one_name_are_refused(tmp_path):
     for place in ("a", "b"):
         (tmp_path / place).mkdir()

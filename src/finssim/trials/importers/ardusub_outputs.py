@@ -58,7 +58,7 @@ def outputs_of(
         basis = "by the motor_index of the vehicle file"
     else:
         outputs, frame = _by_frame(vehicle, parameters)
-        basis = f"by the frame {frame} of the log"
+        basis = f"by the frame {frame}"
     outputs = {
         output: (name, sign * (vehicle.thrusters[name].motor_sign or 1))
         for output, (name, sign) in outputs.items()

@@ -11,6 +11,7 @@ from typing import Annotated
 
 from finssim.core.files import plain_name
 from finssim.core.importer import importers
+from finssim.trials.agreement import unit_findings
 from finssim.trials.findings import CalibrationError, finding
 from finssim.trials.importers.assemble import merge, moved_in_time, split_table, trial_of
 from finssim.trials.importers.column_map import ColumnMap, SourceMap, SplitRule, read_map, split_rule
@@ -67,7 +68,7 @@ def import_trials(
             print(
                 f"{trial.name}: replaced an earlier trial with other data in {folders[-1]}", file=sys.stderr
             )
-        for item in trial.findings:
+        for item in (*trial.findings, *unit_findings(trial)):
             print(item.about(trial.name), file=sys.stderr)
     print_folders(folders, as_json)
     return folders
