@@ -56,7 +56,7 @@ def drag(
     hull, nu=(0,) * 6, v_water=(0,) * 3, gradient=NO_SHEAR, normal=(0, 0, 1), height=DEEP,
     form=FORM, skin=SKIN, kind=0, device="cpu",
 ):  # fmt: skip
-    """Wrenches (..., 6) of `mesh_drag` for arguments with any common leading shape."""
+    """Return wrenches (..., 6) of `mesh_drag` for arguments with any common leading shape."""
     hull = hull_mesh([hull], device) if isinstance(hull, tuple) else hull
     arguments = [(nu, (6,)), (v_water, (3,)), (gradient, (3, 3)), (normal, (3,)), (height, ())]
     arrays = [np.asarray(a, np.float32) for a, _ in arguments]
@@ -75,7 +75,7 @@ def drag(
 
 
 def displacement(hull, normal, height, kind=0, device="cpu"):
-    """Volumes (n,) and centroids (n, 3) of `mesh_displacement` for normals (n, 3) and heights (n,)."""
+    """Return volumes (n,) and centroids (n, 3) of `mesh_displacement` for normals (n, 3) and heights (n,)."""
     hull = hull_mesh([hull], device) if isinstance(hull, tuple) else hull
     inputs = [
         wp.array(np.asarray(normal, np.float32), dtype=wp.vec3, device=device),
@@ -92,7 +92,7 @@ def box(size, center=(0.0, 0.0, 0.0)):
 
 
 def fine_box(size, times):
-    """A box whose faces are split into four, `times` times."""
+    """Return a box whose faces are split into four, `times` times."""
     mesh = trimesh.creation.box(size)
     for _ in range(times):
         mesh = mesh.subdivide()
@@ -113,19 +113,19 @@ FINSROV = parametric_hull((0.56, 0.42, 0.25), 0.0118, (0.0, 0.0, 0.03))
 
 
 def random_surfaces(n, reach, seed):
-    """Unit normals (n, 3) over the sphere and heights (n,) of the body origin within ± reach."""
+    """Return unit normals (n, 3) over the sphere and heights (n,) of the body origin within ± reach."""
     rng = np.random.default_rng(seed)
     normal = rng.normal(size=(n, 3))
     return normal / np.linalg.norm(normal, axis=1, keepdims=True), rng.uniform(-reach, reach, n)
 
 
 def parts_of(hull):
-    """The separate bodies of a hull, which touch or overlap in RexROV's."""
+    """Return the separate bodies of a hull, which touch or overlap in RexROV's."""
     return trimesh.Trimesh(*hull, process=False).split()
 
 
 def wet_boolean(part, normal, height):
-    """A mesh's part below the plane normal·x + height = 0, by an exact boolean with a big box."""
+    """Return the part of a mesh below the plane normal·x + height = 0, by an exact boolean with a large box."""
     side = 10.0
     below = trimesh.creation.box([side, side, side])
     below.apply_translation([0.0, 0.0, -0.5 * side])
@@ -283,7 +283,7 @@ def test_spinning_disc_feels_the_skin_moment():
 
 
 def flap(a, b):
-    """Integral of |y|³ over a plate a x b, which turns about its side a's middle line: a b⁴/32."""
+    """Return the integral of |y|³ over a plate a x b that turns about the middle line of its side a: a b⁴/32."""
     return a * b**4 / 32
 
 
@@ -352,7 +352,7 @@ def test_drag_grows_with_the_square_of_the_velocity():
 
 
 def test_drag_turns_with_the_body():
-    """A hull given in turned axes feels the turned wrench."""
+    """A hull given in rotated axes has the rotated wrench."""
     R = Rotation.from_euler("xyz", [0.4, -0.7, 1.1]).as_matrix()
     nu, normal, height = np.array([0.5, -0.2, 0.3, 0.4, 0.6, -0.5]), np.array([0.48, 0.6, 0.64]), 0.02
     turn = np.kron(np.eye(2), R)
@@ -420,7 +420,7 @@ def test_drag_is_continuous_through_the_surface():
 
 
 def test_each_kind_of_hull_is_its_own():
-    """In one set of arrays every hull acts as it does alone."""
+    """In one set of arrays every hull has the same wrench as alone."""
     hulls = [FINSROV, box((0.6, 0.4, 0.3)), sphere(0.2, 2)]
     together = hull_mesh(hulls, "cpu")
     normal, height = random_surfaces(20, 0.2, seed=6)

@@ -1,4 +1,4 @@
-"""The steady thrust curve and the steps of a motor; the engine's tests check them as they act together."""
+"""The steady thrust curve and the steps of a motor; the engine's tests check them in combination."""
 
 import numpy as np
 import pytest
@@ -48,7 +48,7 @@ def lag_kernel(
 
 
 def run(kernel, arrays, constants, outputs):
-    """Launch over the first dimension of float32 arrays; results as float64."""
+    """Launch over the first dimension of float32 arrays; return results as float64."""
 
     def put(a):
         return wp.array(np.asarray(a, np.float32), dtype=float if np.ndim(a) == 1 else vec8, device="cpu")
@@ -78,7 +78,7 @@ def test_a_thruster_without_a_curve_does_not_turn():
 
 
 def test_a_command_is_limited_and_dead_near_zero():
-    """Each thruster has its own limits and its own dead zone: passed, held at the limit, or zero."""
+    """With its own limits and dead zone each thruster passes a command, limits it, or sets it to zero."""
     rng = np.random.default_rng(1)
     command = rng.uniform(-100.0, 100.0, (N, 8)).astype(np.float32) * rng.choice([0.05, 1.0], (N, 8)).astype(
         np.float32

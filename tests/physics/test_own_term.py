@@ -1,4 +1,4 @@
-"""A hydrodynamic term that the package does not know: one file with all of it, and one line."""
+"""A hydrodynamic term from outside the package: one file with its definition, and one line to register it."""
 # mypy: disable-error-code="valid-type,misc,index,no-any-return,no-untyped-def,untyped-decorator"
 
 import subprocess
@@ -37,7 +37,7 @@ hydrodynamics:
 
 @pytest.fixture(autouse=True)
 def known():
-    """The one line; the next test may say it again."""
+    """The one line that registers the term; a later test may repeat it."""
     assert add_term(WING) is WING
 
 
@@ -49,7 +49,7 @@ def winged(tmp_path):
 
 
 def bare(vehicle, **wing):
-    """A point of diagonal mass 20 kg and 1 kg m² in water that does nothing but what the wing does."""
+    """Return a point of diagonal mass 20 kg and 1 kg m² on which only the wing acts."""
     zero = [0.0] * 6
     base = "hydrodynamics.calibrated"
     return vehicle.replace(
@@ -63,7 +63,7 @@ def bare(vehicle, **wing):
 
 
 def test_a_vehicle_file_may_have_it(winged, tmp_path):
-    """It is read with its origins, changed, written and read again; the vehicle of the catalogue has none."""
+    """It is read with its origins, changed, written and read again; the catalogue's vehicle has none."""
     wing = winged.hydrodynamics["calibrated"].wing
     assert (wing.lift, wing.moment) == (40.0, 1.5)
     assert winged.origin_of("hydrodynamics.calibrated.wing.lift").source == "tow tank"
@@ -86,7 +86,7 @@ def test_a_vehicle_file_may_have_it(winged, tmp_path):
     ],
 )
 def test_its_mistakes_are_told_like_those_of_others(tmp_path, change, sentence):
-    """One sentence with the file and the key."""
+    """The message is one sentence with the file and the key."""
     (tmp_path / "bad.yaml").write_text(FILE.replace("lift: 40.0", change), encoding="utf-8")
     with pytest.raises(VehicleError, match=sentence) as told:
         load_vehicle(tmp_path / "bad.yaml")
@@ -94,7 +94,8 @@ def test_its_mistakes_are_told_like_those_of_others(tmp_path, change, sentence):
 
 
 def test_show_lists_it_and_its_check_is_made(winged):
-    """`finssim vehicles show` has its numbers with their marks; a wing beyond its check is found."""
+    """`finssim vehicles show` prints its numbers with their marks; a wing that violates its check is
+    reported."""
     from io import StringIO
 
     from rich.console import Console
@@ -140,7 +141,7 @@ def test_the_simulator_feels_it(winged, worlds):
 
 @pytest.mark.slow
 def test_blocks_of_worlds_feel_it_as_single_worlds_do(monkeypatch, winged):
-    """The traced path of eight worlds against the kernel for one, each world with a wing of its own."""
+    """The traced path of eight worlds agrees with the kernel for one, with a different wing in each world."""
     runs = []
     for lanes in (True, False):
         monkeypatch.setattr(Simulator, "in_lanes", property(lambda self, lanes=lanes: lanes))
@@ -157,7 +158,7 @@ def test_blocks_of_worlds_feel_it_as_single_worlds_do(monkeypatch, winged):
 
 @pytest.mark.slow
 def test_a_stiff_one_does_not_run_away(winged):
-    """Its slope is taken implicitly: 60 times what an explicit step could take, and w decays."""
+    """Its slope is integrated implicitly: at 60 times the explicit limit w still decays."""
     vehicle = bare(winged, lift=20000.0, moment=0.0)
     sim = Simulator(vehicle, control_step=0.1, substeps=2, threads=1)
     sim.place(position=(0.0, 0.0, -5.0), velocity=(0.8, 0.0, 0.1, 0.0, 0.0, 0.0))
@@ -168,7 +169,7 @@ def test_a_stiff_one_does_not_run_away(winged):
 
 @pytest.mark.slow
 def test_beside_vehicles_without_it(winged):
-    """Two vehicles of a world, one with a wing: the other moves bit for bit as alone among its kind."""
+    """Of two vehicles in a world, one with a wing, the other moves bit for bit as without it."""
     plain = load_vehicle("bluerov2")
     both, alone = (Simulator(pair, threads=1) for pair in ([plain, winged], [plain, plain]))
     for sim in (both, alone):
@@ -185,7 +186,7 @@ RANGES = "wing: {lift: [0.5, 1.5], added_moment: [-1.0, 1.0]}\n"
 
 @pytest.mark.slow
 def test_its_parameters_are_drawn_by_name(winged, tmp_path):
-    """A factor on the file's lift and an addition to its moment; what is not named keeps its number."""
+    """A factor on the file's lift and an addition to its moment; other parameters keep their values."""
     (tmp_path / "ranges.yaml").write_text(RANGES, encoding="utf-8")
     ranges = load_ranges(tmp_path / "ranges.yaml")
     simulator, draws = draw(ranges.model_dump(include={"terms"}), worlds=40, vehicles=winged)
@@ -198,7 +199,7 @@ def test_its_parameters_are_drawn_by_name(winged, tmp_path):
 
 
 def test_ranges_of_a_record_read_back(tmp_path):
-    """What a training keeps of its ranges names the same entries again."""
+    """The ranges saved by a training name the same entries when read again."""
     from finssim.sim.ranges_file import Ranges
 
     (tmp_path / "ranges.yaml").write_text(RANGES + "surge_damping: [0.9, 1.1]\n", encoding="utf-8")
@@ -227,18 +228,19 @@ def test_ranges_that_cannot_be_are_refused(tmp_path, text, sentence):
 
 @wp.func
 def pushing(nu_r: vec6, lift: float, moment: float) -> vec6:
-    """A force without a cause."""
+    """Return a force even at rest."""
     return vec6(1.0, lift, moment, 0.0, 0.0, 0.0)
 
 
 @wp.func
 def curious(nu_r: vec6, lift: float, moment: float, colour: float) -> vec6:
-    """Takes what there is not."""
+    """Take a parameter that does not exist."""
     return vec6(lift, moment, colour, 0.0, 0.0, 0.0)
 
 
 def test_a_term_that_cannot_be_is_refused():
-    """Another of that name, a key of the set's own, an unknown argument, a missing unit, a wrench of nothing."""
+    """Refused are a duplicate name, a reserved key, an unknown argument, a missing unit, and a wrench at
+    rest."""
     units, parts = WING.units, {"schema": Wing, "units": WING.units, "wrench": wing_wrench}
     for term, sentence in (
         (Term(name="wing", **parts), "there is a term 'wing' already"),
@@ -260,7 +262,7 @@ def test_a_term_that_cannot_be_is_refused():
 
 @pytest.fixture(scope="module")
 def trials():
-    """A multisine on surge and heave together of the vehicle with the wing, with noise of its sensors."""
+    """Simultaneous multisines on surge and heave of the vehicle with the wing, with noise of its sensors."""
     from finssim.identification.programme import programmes
     from finssim.identification.synthetic import simulate_programme
 
@@ -271,13 +273,13 @@ def trials():
 
 
 def believed(lift):
-    """The vehicle as somebody has it who does not know the lift."""
+    """Return the vehicle with a wrong value of the lift."""
     return load_vehicle("bluerov2").replace({"hydrodynamics.calibrated.wing": {"lift": lift, "moment": 1.5}})
 
 
 @pytest.mark.slow
 def test_a_calibration_estimates_its_parameter(trials, tmp_path):
-    """40 N s²/m² from trials of a vehicle whose file says 0: within the interval, which is narrower than a tenth."""
+    """From a file with 0, trials give 40 N s²/m² within the interval, which is narrower than a tenth."""
     from finssim.identification.simulation_error import fit_by_simulation
     from finssim.identification.vehicle_file import calibrated, write_ranges
 
@@ -296,7 +298,7 @@ def test_a_calibration_estimates_its_parameter(trials, tmp_path):
 
 @pytest.mark.slow
 def test_a_known_wing_does_not_bias_what_is_fitted(trials):
-    """The damping of heave from trials with a wing: as the file has it where the file has the wing, not without."""
+    """From trials with a wing, heave damping equals the file's if the file has the wing, and not otherwise."""
     from finssim.identification.simulation_error import fit_by_simulation
 
     vehicle = believed(40.0)
@@ -318,14 +320,14 @@ def test_a_parameter_that_the_vehicle_does_not_have_is_refused(trials):
 
 
 def test_the_page_shows_the_example():
-    """Word for word, so that what is read is what runs."""
+    """The page contains the code word for word, so readers see the code that runs."""
     page = (EXAMPLES.parent / "docs" / "reference" / "terms.md").read_text(encoding="utf-8")
     assert f"```py\n{(EXAMPLES / 'own/term/wing.py').read_text(encoding='utf-8')}```" in page
 
 
 @pytest.mark.slow
 def test_the_example_runs():
-    """The wing takes heave out."""
+    """The wing damps heave."""
     run = subprocess.run(
         [sys.executable, EXAMPLES / "own/term/wing.py"], capture_output=True, text=True, check=True
     )
@@ -350,7 +352,7 @@ FIN_DRAG = Term(name="fin_drag", schema=NonNegative, units={"fin_drag": "N s/m"}
 
 
 def test_an_installed_package_brings_its_own(tmp_path, monkeypatch):
-    """A key that nobody imported is found by the entry point of a package: so commands know it too."""
+    """A key that is not imported anywhere is found by a package's entry point, also by the commands."""
     install(tmp_path, monkeypatch, "finned", PACKAGE, {"terms": {"fin_drag": "finned:FIN_DRAG"}})
     vehicle = load_vehicle("bluerov2").replace({"hydrodynamics.calibrated.fin_drag": 3.0})
     assert vehicle.hydrodynamics["calibrated"].term_parameters == {"fin_drag": 3.0}
@@ -361,7 +363,7 @@ def test_an_installed_package_brings_its_own(tmp_path, monkeypatch):
 
 
 def test_a_term_of_a_package_without_a_unit_is_refused_in_one_sentence(tmp_path, monkeypatch):
-    """The sentence names package and object; a vehicle without the key loads as ever."""
+    """The sentence names package and object; a vehicle without the key still loads."""
     bad = PACKAGE.replace('units={"fin_drag": "N s/m"}', "units={}")
     install(tmp_path, monkeypatch, "finless", bad, {"terms": {"fin_drag": "finless:FIN_DRAG"}})
     with pytest.raises(

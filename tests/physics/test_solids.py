@@ -34,12 +34,12 @@ def ball(x):
 
 
 def points(n=60):
-    """Inside and around, away from the faces where gradients jump."""
+    """Return points inside and around, away from the faces where gradients jump."""
     return np.random.default_rng(0).uniform(-1.2, 1.2, (n, 3))
 
 
 def nearest_on_box(x):
-    """Distance by the nearest of the six faces inside, of a clamped point outside; float64."""
+    """Return the distance to the nearest of six faces inside, or of a clamped point outside; float64."""
     if (np.abs(x) < HALF).all():
         return -(HALF - np.abs(x)).min()
     return np.linalg.norm(x - np.clip(x, -HALF, HALF))

@@ -49,7 +49,7 @@ def test_the_vehicle_carries_its_share_of_the_integral():
 
 
 def test_motion_along_a_tether_is_not_hindered():
-    """v parallel to the line: no cross-flow, no drag."""
+    """For v parallel to the line there is no cross-flow and no drag."""
     line, below, still = TetherLine().struct(), wp.vec3(0.0, 0.0, -4.0), wp.vec3(0.0, 0.0, 0.0)
     rising = vec6(0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
     found = tether_wrench(line, RHO, below, wp.quat(0.0, 0.0, 0.0, 1.0), rising, still)
@@ -57,7 +57,7 @@ def test_motion_along_a_tether_is_not_hindered():
 
 
 def test_tethers_that_cannot_be_are_refused():
-    """No thickness, or drag that drives."""
+    """A tether without thickness and a drag that adds energy are refused."""
     with pytest.raises(SurroundingsError, match="tether: diameter is 0.0, expected more than 0 m"):
         TetherLine(diameter=0.0)
     with pytest.raises(SurroundingsError, match="tether: drag_coefficient must not be negative"):

@@ -1,7 +1,7 @@
-"""A program in the place of ArduSub's SITL: `python ardusub_standin.py PORT --model JSON:HOST --sim-port-out N ...`.
+"""Stand-in for ArduSub's SITL: `python ardusub_standin.py PORT --model JSON:HOST --sim-port-out N ...`.
 
-It speaks SITL's JSON interface at the pace of the real one, 400 frames a second, lets the emulated autopilot fly by the
-answers, and serves MAVLink at TCP PORT and PORT + 2, as SITL does at 5760 and 5762. Its own restart is the real one's:
+It speaks SITL's JSON interface at the real rate of 400 frames a second, lets the emulated autopilot fly by the
+answers, and serves MAVLink at TCP PORT and PORT + 2, as SITL does at 5760 and 5762. Its restart is like the real one:
 frames count from 0 again, from another port.
 """
 
@@ -32,7 +32,7 @@ SEA = 1024.0 * 9.80665
 
 
 class StandIn:
-    """One process of SITL after another, on one physics."""
+    """A succession of SITL processes on one physics."""
 
     def __init__(self, port, physics, parameters):
         vehicle = with_navigation(vehicle_at("tank", load_vehicle("bluerov2_heavy")))
@@ -50,13 +50,14 @@ class StandIn:
         self.start()
 
     def start(self):
-        """As a process begins: frames from 0, from a port of its own."""
+        """Start as a new process does: frames from 0, from its own port."""
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.socket.settimeout(0.1)
         self.frame, self.stamp = 0, 0.0
 
     def exchange(self):
-        """One frame; sent again after a second without an answer. The answer, without the newlines around it."""
+        """Send one frame, again after a second without an answer, and return the answer without surrounding
+        newlines."""
         pulses = [*self.firmware.pulses.astype(int).tolist(), *[1500] * (16 - len(self.firmware.pulses))]
         packet = struct.pack("<HHI16H", 18458, RATE, self.frame, *pulses)
         while True:
@@ -70,7 +71,7 @@ class StandIn:
                 return answer
 
     def step(self):
-        """A frame, and what the autopilot makes of it."""
+        """Exchange one frame and step the autopilot with it."""
         state = self.exchange()
         self.now += max(state["timestamp"] - self.stamp, 0.0)
         self.stamp = state["timestamp"]
@@ -88,7 +89,7 @@ class StandIn:
             self.sense(state)
 
     def sense(self, state):
-        """Give the autopilot its instruments, and send what it says."""
+        """Pass the instruments to the autopilot, and send its messages."""
         gyro, accel = (FROM_FOSSEN.vector(state["imu"][name]) for name in ("gyro", "accel_body"))
         depth = state["position"][2]
         sample = FirmwareSample(tuple(gyro), tuple(accel), depth, 101325.0 + SEA * depth)

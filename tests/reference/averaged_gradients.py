@@ -1,11 +1,11 @@
-"""An optimiser in each of several processes, importable by these."""
+"""An optimiser in each of several processes, in a module that these can import."""
 
 import numpy as np
 
 from finssim.learning.layers import Adam, Arrays, FreeRow, NetworkParameters
 
 GRADIENTS = np.random.default_rng(1).normal(size=(3, 2, 5)).astype(np.float32)
-"""Of three steps, two processes and five parameters."""
+"""Gradients of three steps, two processes and five parameters."""
 
 
 def optimized(arrays, gradients):
@@ -20,7 +20,7 @@ def optimized(arrays, gradients):
 
 
 def optimize(group, folder):
-    """Write the parameters of this process, which has gradients of its own."""
+    """Write the parameters of this process, which has its own gradients."""
     values = optimized(Arrays(1, group.device, group), GRADIENTS[:, group.rank])
     np.save(folder / f"begun-{group.rank}.npy", values)
     (folder / f"begun-{group.rank}.npy").rename(folder / f"{group.rank}.npy")

@@ -1,4 +1,4 @@
-"""A bridge with healthy surroundings, each of which a test can spoil."""
+"""A bridge with healthy surroundings, each of which a test can disturb."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ LEVEL = (0.0, 0.0, 0.0, 1.0)
 
 
 def telemetry(count, outputs=8, **changes):
-    """What a healthy motor controller sends as its message of that number: every sensor is a little noisy."""
+    """Return message number `count` of a healthy motor controller, with slight noise on every sensor."""
     values = {
         "sequence": count % 65536,
         "mcu_ms": 10 * count,
@@ -27,19 +27,19 @@ def telemetry(count, outputs=8, **changes):
 
 
 def reading(now, position=(0.0, 0.0, -0.5), quaternion=LEVEL, ready=True, **changes):
-    """What a healthy estimator says."""
+    """Return the reading of a healthy estimator."""
     return Reading(now, np.array(position), np.array(quaternion), np.zeros(6), ready, **changes)
 
 
 def echo(count, accepted=True, mcu_ms=None, flags=0):
-    """What the motor controller made of its command of that number."""
+    """Return the motor controller's echo of command number `count`."""
     ms = 10 * count if mcu_ms is None else mcu_ms
     zeros = (0.0,) * 8
     return CommandEcho(count % 65536, ms, count, ms, 0, accepted, accepted, flags, zeros, zeros, 1, 1)
 
 
 class Rig:
-    """A loop at 60 Hz around a bridge; what is None is not sent."""
+    """A loop at 60 Hz around a bridge; inputs that are None are not sent."""
 
     def __init__(self, vehicle, **changes):
         self.bridge = Bridge(vehicle, BridgeSettings.of(vehicle, **changes))
@@ -48,7 +48,7 @@ class Rig:
         self.frame = None
 
     def step(self, command=None, *, telemetry_=telemetry, reading_=reading, source="pid"):
-        """One turn of the loop; returns the frame that is sent."""
+        """Make one turn of the loop and return the frame that is sent."""
         self.now, self.count = self.now + DT, self.count + 1
         if telemetry_ is telemetry:
             message = telemetry(self.count, self.bridge.motors.outputs, actuators=self.values)
@@ -63,11 +63,11 @@ class Rig:
         return self.frame
 
     def run(self, seconds, command=None, **spoiled):
-        """Turns of the loop; returns the frames."""
+        """Make turns of the loop and return the frames."""
         return [self.step(command, **spoiled) for _ in range(round(seconds / DT))]
 
     def armed(self, command=2.0):
-        """Itself, armed and under way."""
+        """Return the rig itself, armed and in motion."""
         self.run(0.2)
         assert self.bridge.arm(self.now, "operator") == ""
         self.run(0.5, command)
@@ -76,10 +76,10 @@ class Rig:
 
 
 def moves(frame):
-    """Whether a frame could turn a motor."""
+    """Return whether a frame could turn a motor."""
     return frame.enable and any(frame.normalised)
 
 
 def quiet(frame):
-    """Whether a frame says off in every way."""
+    """Return whether a frame is disabled and all its commands are zero."""
     return not frame.enable and not any(frame.normalised)

@@ -27,7 +27,7 @@ ONE_VEHICLE_PER_MODEL = pytest.mark.parametrize("model", ["calibrated", "mesh", 
 
 
 def random_attitudes(rng, n):
-    """Uniform unit quaternions (n, 4), rounded to float32 as a simulator holds them."""
+    """Return uniform unit quaternions (n, 4), rounded to float32 as in a simulator."""
     q = rng.normal(size=(n, 4))
     return (q / np.linalg.norm(q, axis=1, keepdims=True)).astype(np.float32)
 
@@ -67,7 +67,7 @@ def plain(vehicle, keep=("surge_damping",)):
 
 
 def damped(vehicle, model):
-    """Whether the matrices of linear and quadratic damping resist motion along every axis."""
+    """Return whether the matrices of linear and quadratic damping resist motion along every axis."""
     chosen = vehicle.hydrodynamics[model]
     return bool((np.diag(chosen.linear_damping) + np.diag(chosen.quadratic_damping) > 0.0).all())
 
@@ -90,5 +90,5 @@ def neutral(vehicle, buoyancy_above_gravity=0.0):
 
 
 def weightless(vehicle, model):
-    """Neither heavy nor light nor damped: only inertia is left."""
+    """Return the vehicle neutrally buoyant and undamped, with inertia only."""
     return neutral(undamped(vehicle, model))

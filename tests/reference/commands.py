@@ -1,4 +1,4 @@
-"""Every command, those of the extensions included, and how tests type them."""
+"""Every command, including those of extensions, and helpers to run them."""
 
 from finssim.cli import boundary
 from finssim.cli.commands import COMMANDS, app
@@ -9,12 +9,12 @@ EVERY = COMMANDS | {words: FAMILY.reference(words) for words in FAMILY.of_packag
 
 
 def finssim(*words):
-    """Run a command here and now; returns its exit status."""
+    """Run a command in this process and return its exit status."""
     return boundary.run(app, [str(word) for word in words])
 
 
 def refusal(capsys, *words, notes=False):
-    """The one sentence with which a command refuses its input; notes on what it left out may stand before it."""
+    """Return the sentence with which a command refuses its input; notes on omissions may precede it."""
     capsys.readouterr()
     assert finssim(*words) == 2
     out, err = capsys.readouterr()

@@ -34,7 +34,7 @@ def draw(
 
 
 def again(simulator: Simulator, draws: Draws, seed: int = 7) -> None:
-    """Draw anew in every world."""
+    """Draw again in every world."""
     pipeline = simulator.pipeline()
     everywhere = wp.ones(simulator.worlds, dtype=wp.int32, device="cpu")
     draws.add(pipeline, everywhere, seed)
@@ -43,5 +43,5 @@ def again(simulator: Simulator, draws: Draws, seed: int = 7) -> None:
 
 
 def column(draws: Draws, name: str, vehicle: int = 0) -> np.ndarray:
-    """What was drawn for one entry, (worlds,)."""
+    """Return the draws of one entry, (worlds,)."""
     return draws.numpy([name])[:, vehicle, 0].astype(float)
