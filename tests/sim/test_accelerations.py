@@ -14,7 +14,7 @@ from reference.motion import acceleration, coriolis_size, numbers
 
 
 def moving_water(size):
-    """A sheared current and two waves in water a few vehicle lengths deep."""
+    """Return a sheared current and two waves in water a few vehicle lengths deep."""
     return Water(
         current=(0.3, -0.2, 0.05),
         shear=(0.05, 0.1, 0.0),
@@ -31,7 +31,7 @@ EPS = float(np.finfo(np.float32).eps)
 
 
 def accelerations(vehicle, model, states, tau, thrust, water):
-    """nu_dot (n, 6) of the engine and the thrust that each thruster then delivers (n, thrusters)."""
+    """Return nu_dot (n, 6) of the engine and the thrust that each thruster then delivers (n, thrusters)."""
     position, q, nu = (x[:, None] for x in states)
     simulator = Simulator(
         vehicle.replace({"thrusters.*.delay": 0.0}),
@@ -89,7 +89,7 @@ def test_accelerations_agree_with_the_reference(name, model, moving):
 
 
 def dart_body(M):
-    """A free body in DART whose 6x6 spatial inertia is M; DART puts the angular part first."""
+    """Return a free body in DART whose 6x6 spatial inertia is M; DART puts the angular part first."""
     skeleton = dart.dynamics.Skeleton()
     _, body = skeleton.createFreeJointAndBodyNodePair()
     body.setInertia(dart.dynamics.Inertia(M[np.ix_(ANGULAR_FIRST, ANGULAR_FIRST)]))

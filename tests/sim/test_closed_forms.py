@@ -1,6 +1,6 @@
-"""Motions with a solution on paper: terminal speeds, coast-down, pendulum.
+"""Motions with an analytical solution: terminal speeds, coast-down, pendulum.
 
-`bare` keeps a vehicle's numbers on the diagonals and puts all its centres on one point, so that each axis is alone.
+`bare` keeps a vehicle's numbers on the diagonals and puts all its centres on one point, so that axes are decoupled.
 """
 
 import numpy as np
@@ -13,9 +13,9 @@ from reference.hull import drag
 
 EPS = float(np.finfo(np.float32).eps)
 FOSSEN = [(name, model) for name, model in PAIRS if model != "mesh" and damped(load(name), model)]
-"""Not those whose damping is in terms."""
+"""Vehicles whose damping is in matrices, not in terms."""
 MESH = [(name, model) for name, model in PAIRS if model == "mesh" and name != "rexrov"]
-"""Not RexROV: its hull is not symmetric, so drag on one axis alone has a moment."""
+"""Meshes except RexROV's, which is not symmetric, so that drag on one axis alone has a moment."""
 AXES = np.vstack([np.eye(6), -np.eye(6)])
 
 
@@ -39,7 +39,7 @@ def bare(name, model):
 
 
 def numbers_of_axes(vehicle, model):
-    """Mass, linear and quadratic damping of each axis (6,), and H of the point where they hold."""
+    """Return mass, linear and quadratic damping of each axis (6,), and H of the point where they hold."""
     chosen, body = vehicle.hydrodynamics[model], vehicle.body
     added = np.diag(chosen.added_mass) * (model != "simplified")
     m = np.r_[[body.mass] * 3, np.diag(body.inertia)] + added

@@ -1,4 +1,4 @@
-"""Correlated draws reproduce the covariance that they are given, and keep the distributions of their own."""
+"""Correlated draws reproduce the given covariance and keep their own distributions."""
 
 from __future__ import annotations
 

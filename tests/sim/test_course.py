@@ -103,7 +103,7 @@ def test_a_pitch_is_held():
 
 @pytest.mark.slow
 def test_course_over_ground_in_a_current():
-    """0.4 m/s across: the bow points into it, the course does not."""
+    """With 0.4 m/s across, the bow points into the current and the course is kept."""
     orders = {"speed": 1.6, "course": np.array([0.0, 1.0]), "depth": 10.0}
     found = sailed(load_vehicle("remus100"), orders, 80.0, water=Water(current=(0.0, 0.4, 0.0), depth=50.0))
     end = found.time > 50.0
@@ -130,7 +130,7 @@ def test_rows_of_a_batch_are_those_of_one_robot(models):
 
 
 def test_integrals_rest_while_the_channels_cannot_follow(models):
-    """A thrust at its limit: the integral of the speed stays, that of a small error of the course does not."""
+    """With thrust at its limit the integral of the speed is frozen, that of a small course error is not."""
     pilot = CoursePilot(models["cruciform"], "cruciform", PERIOD)
     at = Known(None, np.array([0, 0, -9.0]), np.array([0, 0, 0, 1.0]), np.array([0.9, 0, 0, 0, 0, 0]))
     after = pilot.command(pilot.reset(), at, speed=2.4, course=0.01, depth=9.0)[1][0]
@@ -180,7 +180,7 @@ SEAS = {
 @pytest.mark.parametrize("sea", SEAS)
 @pytest.mark.parametrize("name", ["remus100", "lauv", "eca_a9", "torpedo"])
 def test_course_and_depth_are_held(name, sea):
-    """By every vehicle of the catalogue with fins, a minute after steps of both, at half its speeds."""
+    """Every vehicle of the catalogue with fins holds both, a minute after steps of both, at half its speeds."""
     vehicle, (water, turn, deep) = load_vehicle(name), SEAS[sea]
     speed = float(course_speeds(vehicle)[[0, -1]].mean())
     orders = {"course": np.array([0.0, 1.0, -2.0, 0.5]), "depth": np.array([10.0, 12.0, 9.0, 10.0])}

@@ -28,7 +28,7 @@ EVERY_CASE = pytest.mark.parametrize(
 
 
 def final_state(model, integrator, surroundings, *, worlds=1000, threads=1, seed=11, steps=15):
-    """State after random starts and commands; a smaller number of worlds gets the first of the same ones."""
+    """Return the state after random starts and commands; fewer worlds get the first of the same ones."""
     simulator = Simulator(
         "finsrov",
         worlds=worlds,
@@ -75,7 +75,7 @@ def test_another_seed_is_another_drift():
 
 
 def test_worlds_drift_independently():
-    """Equal vehicles in the same pool feel different currents."""
+    """Equal vehicles in the same pool have different currents."""
     simulator = Simulator(
         "finsrov", worlds=500, water=Water(drift_std=(0.1, 0.1, 0.1), drift_time=0.5), seed=5
     )

@@ -1,4 +1,4 @@
-"""Every distribution gives what its closed form says; what cannot be drawn from is refused in one sentence."""
+"""Every distribution agrees with its closed form, and invalid ones are refused in one sentence."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_with_a_probability_the_number_of_the_file_stays_otherwise():
 
 
 def test_entries_are_independent_of_each_other():
-    """Two entries, two vehicles and two episodes do not correlate."""
+    """Two entries, two vehicles and two episodes are uncorrelated."""
     parts = {"slew": [0.5, 1.5], "mass": [0.5, 1.5], "inertia": [0.5, 1.5]}
     _, draws = draw(parts, worlds=WORLDS, vehicles=["finsrov", "finsrov"])
     everything = [column(draws, name, v) for name in parts for v in range(2)]
@@ -118,7 +118,7 @@ def test_what_cannot_be_drawn_is_refused(case, tmp_path):
 
 
 def test_ranges_are_read_back_from_what_they_are_saved_as():
-    """As a policy's description keeps them."""
+    """They are saved as in a policy's description."""
     ranges = Ranges.model_validate(
         {
             "name": "all",

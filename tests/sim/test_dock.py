@@ -1,4 +1,4 @@
-"""Vehicles in contact with a dock: a press, a bounce, and no way through."""
+"""Vehicles in contact with a dock press, bounce, and never pass through."""
 
 from dataclasses import replace
 
@@ -15,12 +15,13 @@ FINSROV = load("finsrov")
 
 
 def dock_of(vehicle):
-    """The dock of the docking task."""
+    """Return the dock of the docking task."""
     return TASKS["docking"]().fitted([vehicle]).dock()
 
 
 def ball(vehicle):
-    """Neutral, without damping, and with its centres on its origin: kinetic energy is all there is."""
+    """Return a neutral vehicle without damping whose centres are at its origin, so that it has only kinetic
+    energy."""
     changes = {"body.center_of_gravity": [0.0] * 3, "body.center_of_buoyancy": [0.0] * 3}
     return neutral(undamped(vehicle, "calibrated").replace(changes))
 
@@ -51,7 +52,8 @@ def test_a_press_sinks_in_by_force_over_stiffness(integrator, substeps):
 
 
 def shots(rng, worlds, dock, half, speed):
-    """Poses before the dock and body velocities that lead to its front, bore or edge: headings up to 45° off."""
+    """Return poses before the dock and body velocities towards its front, bore or edge: headings up to 45°
+    off."""
     position = np.zeros((worlds, 3))
     position[:, 0] = -dock.cone_length - 0.1 - np.linalg.norm(half)
     reach = dock.mouth_radius + dock.rim
@@ -71,7 +73,8 @@ def kinetic(worlds, vehicle):
 @pytest.mark.slow
 @pytest.mark.parametrize("integrator", ["midpoint", "rk4"])
 def test_a_bounce_gives_back_the_energy_and_no_more(integrator):
-    """Spring alone: what leaves has the energy that came, to the integrator's error. With a damper: less."""
+    """With a spring alone the energy is the same before and after, to the integrator's error; with a damper
+    it is less."""
     vehicle = ball(FINSROV)
     half = 0.5 * np.array(vehicle.body.size)
     elastic = replace(dock_of(vehicle), damping=0.0, friction=0.0)
@@ -95,7 +98,8 @@ def test_a_bounce_gives_back_the_energy_and_no_more(integrator):
 
 @pytest.mark.parametrize("name", ["finsrov", "lauv", "rexrov"])
 def test_nothing_goes_through_at_the_speed_the_dock_is_built_for(name):
-    """No hull point gets deeper than the rim is thick, and what is before the dock does not come out behind it."""
+    """No hull point penetrates deeper than the rim's thickness, and no vehicle passes from the front to
+    behind the dock."""
     vehicle = neutral(load_vehicle(name))
     task = TASKS["docking"]().fitted([vehicle])
     dock, half = task.dock(), 0.5 * np.array(vehicle.body.size)
@@ -117,7 +121,7 @@ def test_nothing_goes_through_at_the_speed_the_dock_is_built_for(name):
 
 
 def test_touching_leaves_no_trace_where_nothing_is_touched():
-    """Far from the dock a vehicle moves as if there were none, to the rounding of another kernel."""
+    """Far from the dock a vehicle moves as without one, to the rounding of another kernel."""
     runs = []
     for dock in (dock_of(FINSROV), None):
         worlds = Simulator("finsrov", worlds=2, dock=dock, control_step=0.1, substeps=20)

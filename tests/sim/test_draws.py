@@ -1,4 +1,4 @@
-"""What each entry of the table does to plant, water, tether and sensors is what its closed form says."""
+"""The effect of each entry of the table on plant, water, tether and sensors agrees with its closed form."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ FACTOR, OFFSET = [0.6, 1.7], [-0.03, 0.05]
 
 
 def parts_for(name: str) -> dict:
-    """A ranges file that draws an entry, and the others of its family where the file cannot part them."""
+    """Return a ranges file that draws an entry, and the others of its family if the file cannot separate
+    them."""
     family, _, rest = name.partition(".")
     if family in ("center_of_gravity", "center_of_buoyancy"):
         return {family: {rest: OFFSET}}
@@ -37,7 +38,7 @@ def parts_for(name: str) -> dict:
 
 
 def shift(r):
-    """H with nu(at r) = H nu(at the origin)."""
+    """Return H with nu(at r) = H nu(at the origin)."""
     x, y, z = r
     H = np.eye(6)
     H[:3, 3:] = [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]
@@ -45,7 +46,8 @@ def shift(r):
 
 
 def expected_plant(x, vehicle):
-    """Every drawn field of the plant for one vehicle, from what was drawn and the vehicle file, in double precision."""
+    """Return every drawn field of the plant for one vehicle, from the draws and the vehicle file, in double
+    precision."""
     body, hydro = vehicle.body, vehicle.hydrodynamics["calibrated"]
     r_g = np.array(body.center_of_gravity) + [x(f"center_of_gravity.{a}") for a in "xyz"]
     r_b = np.array(body.center_of_buoyancy) + [x(f"center_of_buoyancy.{a}") for a in "xyz"]
