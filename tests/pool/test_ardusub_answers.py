@@ -383,7 +383,7 @@ def test_the_ground_station_of_a_disarmed_vehicle_is_missed_with_a_word(ground):
 
 
 def test_what_refuses_to_arm(ground):
-    """A button that disarms, forced or not, does not prevent arming; nor does a low voltage."""
+    """Arming is refused, forced or not, if no button disarms, and at a low voltage."""
     ground.set(BTN4_FUNCTION=0)
     for row, values in (("arm_no_button", (ARM, 1)), ("force_no_button", (ARM, 1, 21196))):
         result, now_armed, texts = SECOND[row]

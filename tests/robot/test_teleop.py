@@ -195,7 +195,7 @@ def test_an_unplugged_pad_disarms():
 
 
 class SlowAutopilot:
-    """An autopilot that arms after several requests and never refuses."""
+    """An autopilot that arms after several requests and never pauses or raises an alarm."""
 
     peer, watched = "autopilot", (("gyro",),)
 
