@@ -1,4 +1,5 @@
-"""Worlds of a few shapes, built once a session: Newton's ray kernels are compiled for the first of them."""
+"""Worlds of a few shapes, built once per session, because Newton's ray kernels are compiled for the first
+world."""
 
 import numpy as np
 import pytest
@@ -71,7 +72,7 @@ def dock():
 
 @pytest.fixture
 def poses():
-    """From positions and attitudes (xyzw) to what sensors take."""
+    """Function that turns positions and attitudes (xyzw) into the poses that sensors take."""
 
     def transforms(*rows):
         table = np.array([(*position, *attitude) for position, attitude in rows], np.float32)
@@ -86,5 +87,5 @@ LEVEL = (0.0, 0.0, 0.0, 1.0)
 
 @pytest.fixture
 def level(poses):
-    """One vehicle at a position, level, looking along x."""
+    """Function that returns the pose of one level vehicle at a position, looking along x."""
     return lambda *position: poses((position, LEVEL))

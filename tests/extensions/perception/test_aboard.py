@@ -1,4 +1,5 @@
-"""Sensors of a vehicle file on the worlds: devices with the mounts, rates and sizes of its entries."""
+"""Sensors of a vehicle file in virtual worlds: devices with the mounts, rates and sizes of the file's
+entries."""
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from finssim.vehicles.device_files import DeviceError, device_of, load_device
 
 @pytest.mark.parametrize("name", catalogue())
 def test_every_vehicle_has_an_altimeter_that_looks_down(name):
-    """From under its hull, as the device's file turns it."""
+    """Every altimeter looks down from below the hull, turned by the mount in the device's file."""
     vehicle = load_vehicle(name)
     device = device_of(vehicle, "altimeter")
     np.testing.assert_allclose(
@@ -22,7 +23,8 @@ def test_every_vehicle_has_an_altimeter_that_looks_down(name):
 
 
 def test_an_entry_scales_its_camera_and_its_sonar():
-    """Width and what follows from it: the field of view stays that of the device."""
+    """An entry scales the width and everything that follows from it; the field of view remains that of the
+    device."""
     vehicle, full = load_vehicle("finsrov"), load_device("low_light_camera")
     camera = device_of(vehicle, "front_camera")
     assert (camera.width, camera.height) == (48, 27) and camera.lens().width == 48
@@ -41,7 +43,7 @@ def test_an_entry_scales_its_camera_and_its_sonar():
     ],
 )
 def test_what_is_no_sensor_is_refused(changes, name, message):
-    """In one sentence that names the vehicle's entry."""
+    """An entry that is not a sensor is refused in one sentence that names it."""
     vehicle = load_vehicle("finsrov").replace(changes)
     with pytest.raises(DeviceError, match=message.replace("?", r"\?")) as refused:
         device_of(vehicle, name)
@@ -49,7 +51,8 @@ def test_what_is_no_sensor_is_refused(changes, name, message):
 
 
 def test_sensors_stand_where_the_vehicle_carries_them(scenes, poses):
-    """Over a floor 10 m down, at 5 m: the altimeter's range is that from under the hull; the others have their kind."""
+    """At 5 m over a floor 10 m down, the altimeter measures its range from below the hull; all sensors have
+    their kind."""
     vehicle, batch = load_vehicle("finsrov"), scenes("floor")
     here = poses(((0.0, 0.0, -5.0), (0.0, 0.0, 0.0, 1.0)))
     altimeter = sensor_of(batch, vehicle, "altimeter")

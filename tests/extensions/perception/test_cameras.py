@@ -1,4 +1,4 @@
-"""Cameras: where points appear, and what water, daylight, lamps and the pixel make of radiance."""
+"""Cameras: image positions of points, and radiance after water, daylight, lamps and pixel noise."""
 
 import math
 
@@ -31,7 +31,8 @@ def camera(**changes):
     ids=["pinhole", "distorted", "fisheye", "flat port"],
 )
 def test_balls_appear_where_their_middles_project(device, scenes, level):
-    """Within 0.3 px of the lens' own projection; behind a flat port, of the refracting projection of `geometry`."""
+    """Balls appear within 0.3 px of the lens's projection; behind a flat port, of the refracting one of
+    `geometry`."""
     batch = scenes("targets")
     sensor = CameraBatch(batch, device)
     sensor.update(level(0, 0, -5))
@@ -62,7 +63,7 @@ def looking_at(scenes, level, position, **options):
 
 
 def test_radiance_is_the_integral_of_what_the_water_adds_and_takes(scenes, level):
-    """Of pixels up, down and aside: the wall, and the veil before it by numerical integration along the ray.
+    """Pixels that look up, down and sideways show the wall and the veil before it, integrated along the ray.
 
     L = rho E e^(-K h_p) e^(-c s) + integral of c B e^(-K h(t)) e^(-c t) dt, with the wall upright: E = 1/2 + B/2.
     """
@@ -75,7 +76,7 @@ def test_radiance_is_the_integral_of_what_the_water_adds_and_takes(scenes, level
         ray = rays[i, j]
         s = 3.0 / ray[0]
         if -5.0 + s * ray[2] > 0.0:
-            continue  # it meets the surface first
+            continue  # the ray meets the surface first
         for k in range(3):
 
             def veil(t, k=k, u=ray[2]):
@@ -99,9 +100,9 @@ def test_snells_window_is_as_wide_as_total_reflection_begins(scenes, poses):
 
 
 def test_a_lamp_falls_off_as_the_square_and_by_both_ways(scenes, level):
-    """What a lamp at the camera adds to a wall head-on, at 2 and 4 m: rho I e^(-2 c s)/s², beside its veil.
+    """A lamp at the camera adds rho I e^(-2 c s)/s² to a wall seen head-on at 2 and 4 m, and a veil.
 
-    That is the integral of c B I e^(-2 c t)/t², from the least distance of 0.15 m.
+    The veil is the integral of c B I e^(-2 c t)/t², from the least distance of 0.15 m.
     """
     light = (Headlight(position=(0.0, 0.0, 0.0), intensity=0.8, half_angle=1.0),)
     for distance in (2.0, 4.0):
@@ -115,7 +116,8 @@ def test_a_lamp_falls_off_as_the_square_and_by_both_ways(scenes, level):
 
 
 def test_noise_is_that_of_photons_and_reading(scenes, poses):
-    """Over water of even radiance: variance = charge + read², in numbers, quantisation's 1/12 included."""
+    """Over water of even radiance, the variance is charge + read² in digital numbers, plus 1/12 for
+    quantisation."""
     device = camera(exposure=2.0, gamma=1.0, full_well=800.0, read_noise=6.0, width=200, height=200)
     sensor = CameraBatch(scenes("floor"), device)
     sensor.batch.optics.veil.fill_(wp.vec3(0.1, 0.2, 0.3))
@@ -133,7 +135,8 @@ def test_noise_is_that_of_photons_and_reading(scenes, poses):
 
 
 def test_equal_seeds_give_equal_pictures(dock, poses):
-    """Bit for bit, another seed or time another one; and of a world alone as of three."""
+    """Equal seeds give bit-identical pictures, for one world as for three; another seed or time gives another
+    one."""
     place = ((0.2, -0.7, -3.3), (0, 0, 0, 1))
     device = camera(width=64, height=48, focal_length=40.0)
     sensor = CameraBatch(dock, device)
@@ -142,7 +145,7 @@ def test_equal_seeds_give_equal_pictures(dock, poses):
     np.testing.assert_array_equal(first, second)
     for other in ({"seed": 5}, {"seed": 4, "time": 0.1}):
         assert not np.array_equal(first, sensor.update(poses(place, place, place), **other).numpy())
-    assert not np.array_equal(first[0], first[1])  # docks differ, as they were drawn
+    assert not np.array_equal(first[0], first[1])  # the docks differ, as each was drawn separately
     alone = WorldBatch("dock")
     alone.draw(1)
     np.testing.assert_array_equal(
@@ -151,7 +154,7 @@ def test_equal_seeds_give_equal_pictures(dock, poses):
 
 
 def test_vehicles_outside_the_mask_keep_their_pictures(dock, poses):
-    """A camera, a sonar and an altimeter of the second of three: the others' readings stay, bit for bit."""
+    """When only the second of three vehicles is measured, the readings of the others stay bit-identical."""
     far, near = ((0.2, -0.7, -3.3), (0, 0, 0, 1)), ((0.9, -0.3, -3.0), (0, 0, 0, 1))
     mask = wp.array([0, 1, 0], dtype=int)
     for sensor in (
@@ -164,12 +167,12 @@ def test_vehicles_outside_the_mask_keep_their_pictures(dock, poses):
         changed = [not np.array_equal(a, b) for a, b in zip(first, second, strict=True)]
         assert changed == [False, True, False]
         everyone = sensor.update(poses(near, near, near), seed=2).numpy()
-        if not isinstance(sensor, CameraBatch):  # whose exposure has moved since
+        if not isinstance(sensor, CameraBatch):  # its exposure has changed since
             np.testing.assert_array_equal(everyone[1], second[1])
 
 
 def test_exposure_settles_on_its_aim(dock, poses):
-    """Within a dozen pictures the mean is what automatic exposure aims at."""
+    """Within a dozen pictures the mean reaches the target of automatic exposure."""
     place = ((0.2, -0.7, -3.3), (0, 0, 0, 1))
     sensor = CameraBatch(
         dock, camera(width=64, height=48, focal_length=40.0, exposure="auto", white_balance=0.5)
@@ -180,6 +183,6 @@ def test_exposure_settles_on_its_aim(dock, poses):
 
 
 def test_another_number_of_vehicles_is_refused(dock, level):
-    """One pose for three worlds."""
+    """One pose for three worlds is refused."""
     with pytest.raises(ValueError, match="1 poses for 3 vehicles"):
         CameraBatch(dock, camera(width=32, height=24, focal_length=20.0)).update(level(0, 0, -1))

@@ -1,4 +1,4 @@
-"""Kernels of ray sensors for a GPU, where there is none to run them."""
+"""Kernels of ray sensors compile for a GPU on machines without one."""
 
 import importlib
 import pkgutil
@@ -16,7 +16,7 @@ NAMES = [
 
 @pytest.mark.slow
 def test_every_kernel_compiles_for_cuda(tmp_path):
-    """NVRTC, which needs no device, makes code (PTX) of each module with kernels for compute capability 7.5."""
+    """NVRTC, which needs no device, compiles each module with kernels to PTX for compute capability 7.5."""
     wp.init()
     if wp.get_cuda_toolkit_version() is None:
         pytest.skip("this Warp has no CUDA compiler")

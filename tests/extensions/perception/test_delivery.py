@@ -1,4 +1,4 @@
-"""Rate, latency and loss of readings, against the definition of each."""
+"""Rate, latency and loss of readings, compared with their definitions."""
 
 import numpy as np
 import pytest
@@ -31,7 +31,8 @@ def altimeter(batch, vehicles=1, **options):
 
 
 def play(delivery, steps, episodes=None):
-    """Ranges and ages by step, of vehicles that rise by 1 cm a step from 5 m over the floor; (steps, N) each."""
+    """Return ranges and ages by step, (steps, N) each, of vehicles that rise by 1 cm a step from 5 m over the
+    floor."""
     count, readings, ages = delivery.sensor.count, [], []
     episodes = np.zeros((len(steps), 2), int) if episodes is None else episodes
     for row, episode in zip(np.asarray(steps), episodes, strict=True):
@@ -51,19 +52,20 @@ def both(n):
 
 
 def test_every_reading_is_that_of_its_age(floors):
-    """2.5 Hz and 0.2 s late: a reading is the range at t - age; its age runs from 0.2 to 0.5 s, again and again."""
+    """At 2.5 Hz with 0.2 s latency, a reading is the range at t - age; its age repeatedly runs from 0.2 to
+    0.5 s."""
     readings, ages = play(altimeter(floors, rate=2.5, latency=0.2), both(40))
     t = STEP * np.arange(40)[:, None]
     np.testing.assert_allclose(readings, 5.0 + 0.1 * (t - ages), atol=1e-5)
     late = ages[6:, 0]
     assert late.min() == pytest.approx(0.2, abs=1e-6) and late.max() == pytest.approx(0.5, abs=1e-6)
-    assert np.sum(np.diff(ages[:, 0]) < 0.0) == 9  # of the samples at 0.4, 0.8, ... 3.6 s
-    # The first arrives at once, and is all there is until the second does.
+    assert np.sum(np.diff(ages[:, 0]) < 0.0) == 9  # samples at 0.4, 0.8, ... 3.6 s
+    # The first reading arrives at once and remains the only one until the second arrives.
     np.testing.assert_allclose(ages[:6, 0], STEP * np.arange(6), atol=1e-6)
 
 
 def test_losses_leave_the_last_reading_on_display(floors):
-    """Of 600 readings a quarter never arrives, to four standard deviations; the first of an episode always does."""
+    """A quarter of 600 readings is lost, to four standard deviations; the first of an episode always arrives."""
     readings, ages = play(altimeter(floors, rate=10.0, loss=0.25, seed=3), both(300))
     np.testing.assert_allclose(readings, 5.0 + 0.1 * (STEP * np.arange(300)[:, None] - ages), atol=1e-4)
     missing = ages[1:] > 0.5 * STEP
@@ -73,7 +75,7 @@ def test_losses_leave_the_last_reading_on_display(floors):
 
 
 def test_a_reset_world_forgets_what_was_on_its_way(floors):
-    """World 1 is reset after 5 steps: its first reading is of the new episode and arrives at once; world 0 goes on."""
+    """World 1 is reset after 5 steps: its first new reading arrives at once; world 0 continues."""
     steps, episodes = both(12), np.zeros((12, 2), int)
     steps[5:, 1] -= 5
     episodes[5:, 1] = 1

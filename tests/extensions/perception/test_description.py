@@ -1,4 +1,5 @@
-"""World and sensor files: the catalogue loads, what cannot be is refused in one sentence, formulas of sound."""
+"""World and sensor files: the catalogue loads, invalid files are refused in one sentence, and formulas of
+sound."""
 
 import math
 import re
@@ -37,7 +38,8 @@ def written(path, text=WORLD, name="world.yaml"):
 
 @pytest.mark.parametrize("name", sites())
 def test_every_site_loads(name):
-    """Each file of the catalogue is a world with something to see, and a place in the water to see it from."""
+    """Each file of the catalogue is a world with visible objects and a position in the water to view them
+    from."""
     world = load_world(name)
     assert world.objects and world.viewpoint.position[2] < 0.0 and world.about
 
@@ -78,7 +80,7 @@ def test_every_sensor_says_where_its_figures_are_from(name):
     ],
 )  # fmt: skip
 def test_what_cannot_be_is_refused_in_one_sentence(old, new, sentence, tmp_path):
-    """The message names the file, the key and what was expected."""
+    """The message names the file, the key and the expected value."""
     assert old in WORLD
     with pytest.raises(WorldError) as refused:
         load_world(written(tmp_path, WORLD.replace(old, new, 1)))
@@ -86,7 +88,7 @@ def test_what_cannot_be_is_refused_in_one_sentence(old, new, sentence, tmp_path)
 
 
 def test_places_that_come_of_files_are_within_reach(tmp_path):
-    """Heights of a table, a slope over a wide bed, and a mesh that is scaled up."""
+    """Heights of a table, a slope over a wide bed and a scaled-up mesh stay within the limits of positions."""
     (tmp_path / "bed.csv").write_text("0,1\n-1e300,0\n")
     write_stl(tmp_path / "a.stl", 1e4 * np.eye(4, 3), [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)])
     for old, new, sentence in (
@@ -104,7 +106,7 @@ def test_places_that_come_of_files_are_within_reach(tmp_path):
 
 
 def test_a_sensor_of_no_kind_and_a_site_of_no_name_are_refused(tmp_path):
-    """What there is stands in the message."""
+    """The message lists the available kinds and sites."""
     with pytest.raises(DeviceError, match="kind is 'radar', expected one of camera, sonar, range"):
         load_device(written(tmp_path, "kind: radar\n"))
     with pytest.raises(DeviceError, match="kind is \\['camera'\\], expected one of"):
@@ -124,7 +126,7 @@ def test_a_sensor_of_no_kind_and_a_site_of_no_name_are_refused(tmp_path):
 
 
 def test_an_exposure_is_auto_or_a_number(tmp_path):
-    """One sentence, though there are two forms."""
+    """The refusal is one sentence, although there are two forms."""
     camera = (
         "kind: camera\nabout: x\nsource: y\nwidth: 64\nheight: 48\nfocal_length: 50\nrate: 10\nexposure: "
     )
@@ -135,7 +137,7 @@ def test_an_exposure_is_auto_or_a_number(tmp_path):
 
 
 def test_heights_are_slope_roughness_and_table(tmp_path):
-    """They add up: the slope exactly, the table stretched linearly, roughness with its root mean square."""
+    """Heights add up: the slope exactly, the table stretched linearly, roughness with its root mean square."""
     (tmp_path / "bump.csv").write_text("0,0,0\n0,1,0\n0,0,0\n", encoding="utf-8")
     text = WORLD.replace("spacing: 1.0", "spacing: 0.5, heights: bump.csv")
     z = load_world(written(tmp_path, text)).seabed_heights()
@@ -150,7 +152,7 @@ def test_heights_are_slope_roughness_and_table(tmp_path):
 
 @pytest.mark.parametrize("axis", [(0, 0, 2), (0, 0, -1), (1, 0, 0), (1, -2, 0.5)])
 def test_the_z_axis_of_a_shape_points_where_axis_says(axis):
-    """For every direction, upside down too."""
+    """The z axis of a shape points along `axis` for every direction, upside down too."""
     item = Object(shape="plane", position=[0, 0, 0], axis=list(axis))
     np.testing.assert_allclose(
         quat_rotate(item.quaternion, [0, 0, 1]), np.array(axis) / np.linalg.norm(axis), atol=1e-12
@@ -168,14 +170,18 @@ def sea(temperature, salinity):
 
 
 def test_sound_is_as_fast_as_the_sea_is_warm_and_salty():
-    """1489.8 m/s at 10 °C and 35 (UNESCO, Fofonoff & Millard 1983) within 0.5; 1482.3 m/s in fresh water at 20 °C (Del
-    Grosso & Mader 1972) within 1."""
+    """The speed of sound matches published values at two temperatures.
+
+    1489.8 m/s at 10 °C and 35 (UNESCO, Fofonoff & Millard 1983) within 0.5; 1482.3 m/s in fresh water at 20 °C (Del
+    Grosso & Mader 1972) within 1.
+    """
     assert sea(10.0, 35.0).sound_speed == pytest.approx(1489.8, abs=0.5)
     assert sea(20.0, 0.0).sound_speed == pytest.approx(1482.3, abs=1.0)
 
 
 def test_fresh_water_absorbs_by_the_square_of_frequency():
-    """25e-15 f² Np/m at 20 °C (Fisher & Simmons 1977) within a tenth; at 100 kHz most is of salt."""
+    """Absorption is 25e-15 f² Np/m at 20 °C (Fisher & Simmons 1977) within a tenth; at 100 kHz salt causes
+    most of it."""
     fresh = sea(20.0, 0.0)
     for frequency in (1e5, 7.2e5, 2e6):
         expected = 25e-15 * frequency**2 * 20.0 / math.log(10.0)
@@ -189,5 +195,5 @@ def test_the_catalogue_is_packaged_beside_the_module():
 
 
 def test_the_pool_has_the_water_of_the_overhead_camera():
-    """One definition: what a camera under water sees through is what the one above it does."""
+    """The pool's water has one definition, shared by underwater cameras and the overhead camera."""
     assert load_world("pool").water.optical == WaterOptics()

@@ -1,4 +1,4 @@
-"""Docking: what is seen, rewarded, ended and counted; against NumPy and SciPy."""
+"""Docking: observations, rewards, ends and counts, compared with NumPy and SciPy."""
 
 import math
 from dataclasses import replace
@@ -18,7 +18,7 @@ DEEP = (0.0, 0.0, -1.4)
 
 
 def truth(env):
-    """Nose in dock axes, rotation of the dock in the body, body to world, twist."""
+    """Return the nose in dock axes, the rotation of the dock in the body, body to world, and the twist."""
     state, a = env.simulator.state, env.arrays
     R = Rotation.from_quat(state.quaternion.numpy()[:, 0])
     R_dock = Rotation.from_quat(a.goal_quaternion.numpy())
@@ -28,7 +28,7 @@ def truth(env):
 
 
 def at(env, nose, **options):
-    """Vehicles at rest with their noses on places in dock axes, the dock pointing along world x."""
+    """Place vehicles at rest with their noses at points in dock axes, the dock pointing along world x."""
     nose = np.atleast_2d(np.asarray(nose, float))
     env.start(nose - [0.5 * env.task.hull.length, 0.0, 0.0] + np.array(DEEP), LEVEL, DEEP, LEVEL)
 
@@ -53,7 +53,7 @@ def test_the_observation_says_where_the_berth_is_and_how_the_dock_stands():
 
 
 def test_the_reward_is_the_sum_of_its_terms():
-    """With and without contact: some worlds press against the tube's end."""
+    """The reward is the sum of its terms with and without contact: some worlds press against the tube's end."""
     env, r = make("docking", worlds=32), TASK.reward
     length, dock = env.task.hull.length, env.task.dock()
     places = np.zeros((32, 3))
@@ -92,7 +92,8 @@ def test_resting_in_the_berth_earns_the_most_there_is():
 
 @pytest.mark.parametrize(("part", "success"), [(0.55, 1.0), (0.4, 0.0)])
 def test_success_is_a_nose_in_the_tube_for_a_while(part, success):
-    """Beyond half of the tube, at rest, for two seconds; its time is when these two seconds were over."""
+    """Success is a nose beyond half of the tube, at rest, for two seconds; its time is the end of these two
+    seconds."""
     env = Environment(replace(TASK, time_limit=3.0), worlds=2)
     at(env, [part * env.task.dock().tube_length, 0.0, 0.0])
     for _ in range(30):
@@ -104,7 +105,7 @@ def test_success_is_a_nose_in_the_tube_for_a_while(part, success):
 
 
 def test_a_press_is_counted_and_allowed():
-    """Full thrust against the end: the impulse is thrust times time, and the episode goes on."""
+    """Full thrust against the end adds an impulse of thrust times time, and the episode continues."""
     env = Environment(replace(TASK, time_limit=4.0), worlds=1)
     at(env, [env.task.dock().tube_length - 0.002, 0.0, 0.0])
     action = np.array([[1.0, 0.0, 0.0, 0.0, 0.0, 0.0]])
@@ -118,7 +119,8 @@ def test_a_press_is_counted_and_allowed():
 
 
 def test_a_hard_hit_ends_the_episode_as_a_crash():
-    """Into the tube's end at the speed the dock is built for: terminated with the loss, and no success."""
+    """A hit of the tube's end at the dock's design speed terminates the episode with the loss and without
+    success."""
     env = make("docking", auto_reset=False)
     at(env, [env.task.dock().tube_length - 0.02, 0.0, 0.0])
     nu = np.zeros((1, 1, 6), np.float32)
@@ -133,7 +135,10 @@ def test_a_hard_hit_ends_the_episode_as_a_crash():
 
 
 def test_episodes_start_before_the_mouth_of_docks_anywhere():
-    """Noses in their box in dock axes, headings within `turn`, docks in their box with any heading, nothing touched."""
+    """Noses start in their box in dock axes with headings within `turn`.
+
+    Docks lie in their box with any heading, and nothing is in contact.
+    """
     env = make("docking", worlds=2048, threads=1)
     nose, relative, R, nu = truth(env)
     dock, length = env.task.dock(), env.task.hull.length
@@ -154,7 +159,7 @@ def test_episodes_start_before_the_mouth_of_docks_anywhere():
 
 @pytest.mark.parametrize("name", THRUSTED)
 def test_every_vehicle_gets_a_dock_it_fits_in(name):
-    """The tube takes the envelope with room to spare, the block stands in the tank, a gentle press is no crash."""
+    """The tube is wider than the envelope, the block stands in the tank, and a gentle press is not a crash."""
     task = TASK.fitted([load_vehicle(name)])
     dock, hull, pool = task.dock(), task.hull, task.arena()
     half = 0.5 * np.array(load_vehicle(name).body.size)
@@ -169,7 +174,7 @@ def test_every_vehicle_gets_a_dock_it_fits_in(name):
 
 
 def test_the_hull_that_stands_for_none_is_finsrovs():
-    """A task that is asked before it is fitted answers for FinsROV."""
+    """A task that is read before it is fitted uses the values of FinsROV."""
     own = HullNumbers.of(load_vehicle("finsrov"))
     assert TASK.hull.length == own.length and TASK.hull.speed == pytest.approx(own.speed, rel=0.01)
     assert TASK.hull.girth == pytest.approx(own.girth, rel=0.01)

@@ -1,4 +1,4 @@
-"""The referee: Mitsuba 3, which shares no code with our cameras, shows a world as they do."""
+"""Reference renderer Mitsuba 3, which shares no code with the package's cameras, renders worlds as they do."""
 
 import math
 
@@ -18,7 +18,7 @@ from finssim.vehicles.device_files import CameraDevice, Port
 pytestmark = pytest.mark.slow
 
 COLUMNS, ROWS, FINE = 80, 60, 6
-"""Pixels that are compared, and along each axis of one how many of ours: each of these has one ray."""
+"""Compared pixels, and number of the camera's pixels, of one ray each, along each axis of a compared pixel."""
 PORT = Port(distance=0.02, thickness=0.006)
 WATER = 1.333
 SUN, DIFFUSE = np.array([0.3, 0.2, 1.0]), 0.4
@@ -30,17 +30,17 @@ OBJECTS = {
     "post": {"shape": "cylinder", "radius": 0.15, "length": 1.2, "position": [3.0, 0.1, -5.7],
              "axis": [0.5, 0.8, 0.6], "colour": [0.4, 0.5, 0.9]},
 }  # fmt: skip
-"""World frame; the camera stands at (0, 0, -5) and looks along x. None hides another."""
+"""World frame; the camera is at (0, 0, -5) and looks along x. No object hides another."""
 
 
 @pytest.mark.parametrize(
     ("port", "glowing"), [(PORT, False), (PORT, True), (None, False)], ids=["port", "port, murky", "dome"]
 )
 def test_pictures_are_those_of_mitsuba(port, glowing, poses, tmp_path):
-    """Things stand within 0.1 px of where Mitsuba shows them, and the radiance differs by 3 % rms of its range.
+    """Objects appear within 0.1 px of Mitsuba's positions, and the radiance differs by 3 % rms of its range.
 
-    Up to one factor, as an exposure is: the port's faces reflect 4.2 % at normal incidence, which ours leave out.
-    Most of the rms is Mitsuba's own noise.
+    Radiance is compared up to one factor, like that of an exposure: the port's faces reflect 4.2 % at normal
+    incidence, which the package's cameras omit. Most of the rms is Mitsuba's own noise.
     """
     batch = world_of(glowing, tmp_path)
     sensor, radiance = ours(port, batch, poses)
@@ -52,7 +52,7 @@ def test_pictures_are_those_of_mitsuba(port, glowing, poses, tmp_path):
     dv, du = np.gradient(expected, axis=(0, 1))
     index = sensor.shape_index.numpy()[0].reshape(ROWS, FINE, COLUMNS, FINE).swapaxes(1, 2)
     for k in range(len(OBJECTS)):
-        # By how much the one picture is shifted against the other around a thing, from its slopes.
+        # Shift of one picture against the other around an object, from the picture's slopes.
         near = binary_dilation((index == k).any((2, 3)), iterations=2)
         slopes = np.stack([du[near].ravel(), dv[near].ravel()], axis=1)
         shift = np.linalg.lstsq(slopes, (expected - radiance)[near].ravel(), rcond=None)[0]
@@ -60,7 +60,8 @@ def test_pictures_are_those_of_mitsuba(port, glowing, poses, tmp_path):
 
 
 def world_of(glowing, tmp_path):
-    """The world that our cameras see: lit from above in clear water, or glowing in dark and murky water."""
+    """Return the world of the package's cameras: lit from above in clear water, or glowing in dark and murky
+    water."""
     lines = ["about: Three things.", "viewpoint: {position: [0, 0, -5]}"]
     attenuation = list(ATTENUATION) if glowing else [0, 0, 0]
     lines.append(f"water: {{attenuation: {attenuation}, veil: [0, 0, 0], daylight_attenuation: [0, 0, 0]}}")
@@ -80,7 +81,7 @@ def world_of(glowing, tmp_path):
 
 
 def ours(port, batch, poses):
-    """The sensor, and the mean radiance of each pixel, (ROWS, COLUMNS, 3)."""
+    """Return the sensor and the mean radiance of each pixel, (ROWS, COLUMNS, 3)."""
     device = CameraDevice(about="-", source="-", width=COLUMNS, height=ROWS, focal_length=62.0, exposure=1.0, rate=10.0,
                           port=port)  # fmt: skip
     sensor = CameraBatch(batch, device, width=FINE * COLUMNS, linear=True)
@@ -90,7 +91,8 @@ def ours(port, batch, poses):
 
 
 def referee(port, glowing, batch):
-    """The same picture by Mitsuba: path tracing through two dielectric faces, on surfaces that it lights itself."""
+    """Return Mitsuba's picture: path tracing through two dielectric faces, on surfaces that Mitsuba lights
+    itself."""
     mi.set_variant("scalar_rgb")
     axes = np.eye(4)
     axes[:3, :3] = np.stack([FROM_OPTICAL.vector(v) for v in np.eye(3)], axis=1) @ np.diag([-1.0, -1.0, 1.0])
@@ -136,7 +138,8 @@ def referee(port, glowing, batch):
             scene["face1"]["interior"] = sea
 
     def picture(brightness):
-        """Of one thing after the other: together, each takes some of the others' daylight, which ours leave out."""
+        """Render one object at a time: together, each blocks daylight of the others, which the package's
+        cameras omit."""
         total = np.zeros((ROWS, COLUMNS, 3))
         for name, item in OBJECTS.items():
             alone = dict(scene)
@@ -151,12 +154,12 @@ def referee(port, glowing, batch):
             total += np.array(mi.render(mi.load_dict(alone), seed=1), dtype=float)[..., :3]
         return total
 
-    # Without what lies behind them, which black things leave as it is.
+    # Subtract the background, which black objects leave unchanged.
     return picture(1.0) if glowing else math.pi * (picture(1.0) - picture(0.0))
 
 
 def shapes_of(item, pose):
-    """Mitsuba's shapes for one object, at a pose of the world frame (7,)."""
+    """Return Mitsuba's shapes for one object at a pose of the world frame (7,)."""
     to_world = np.eye(4)
     to_world[:3, :3], to_world[:3, 3] = quat_to_matrix(pose[3:]), pose[:3]
     if item["shape"] == "sphere":
@@ -165,7 +168,7 @@ def shapes_of(item, pose):
         size = np.diag([0.5 * s for s in item["size"]] + [1.0])
         return [{"type": "cube", "to_world": mi.ScalarTransform4f(to_world @ size)}]
     half, r = 0.5 * item["length"], item["radius"]
-    ends = [np.diag([r, s * r, s * r, 1.0]) for s in (-1.0, 1.0)]  # of the unit disk, z outwards
+    ends = [np.diag([r, s * r, s * r, 1.0]) for s in (-1.0, 1.0)]  # vertices of the unit disk, z outwards
     for s, end in zip((-1.0, 1.0), ends, strict=True):
         end[2, 3] = s * half
     bottom, top = ((to_world @ [0, 0, s * half, 1])[:3].tolist() for s in (-1.0, 1.0))

@@ -1,4 +1,4 @@
-"""Copies of a world: what a draw moves, and what it leaves."""
+"""Copies of a world: quantities that a draw changes, and quantities that it leaves."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ pytestmark = pytest.mark.slow
 
 
 def test_a_world_is_drawn_from_the_seed_and_its_number_alone(dock):
-    """Three docks and one dock: the first is the same; another seed draws another one."""
+    """The first of three docks equals a single dock; another seed draws another dock."""
     single = WorldBatch("dock")
     rest = single.poses("back").copy()
     single.draw(1)
@@ -23,7 +23,7 @@ def test_a_world_is_drawn_from_the_seed_and_its_number_alone(dock):
 
 
 def test_worlds_outside_the_mask_stay(dock):
-    """Only the second of three docks is drawn anew, and back again as it was."""
+    """Only the second of three docks is redrawn, and a redraw with the first seed restores it."""
     before = dock.poses("back").copy()
     dock.draw(7, mask=[False, True, False])
     changed = np.any(dock.poses("back") != before, axis=1)
@@ -33,7 +33,8 @@ def test_worlds_outside_the_mask_stay(dock):
 
 
 def test_things_in_a_frame_move_with_it(dock):
-    """The throat of the funnel stays 0.95 m before the plate, in the plate's axes, however the dock is drawn."""
+    """The throat of the funnel stays 0.95 m before the plate, in the plate's axes, for every draw of the
+    dock."""
     back, rail = dock.poses("back"), dock.poses("rails_upper")
     offset = quat_inverse_rotate(back[:, 3:], rail[:, :3] - back[:, :3])
     np.testing.assert_allclose(offset, np.tile([0.48 - 0.95, -0.24, 0.27], (3, 1)), atol=1e-5)
@@ -41,7 +42,8 @@ def test_things_in_a_frame_move_with_it(dock):
 
 
 def test_draws_stay_within_what_the_file_says():
-    """256 pools: the marker is within its shifts, the water within a factor of 2, and both use most of that."""
+    """In 256 pools the marker stays within its shifts and the water within a factor of 2; both use most of
+    the range."""
     batch = WorldBatch("pool", worlds=256)
     batch.draw(3)
     item, water = batch.world.objects["marker"], batch.world.water

@@ -1,4 +1,4 @@
-"""The vehicle's own cameras, sonars and altimeters in the virtual site: at their rate, late, lost, on the wire."""
+"""The vehicle's own cameras, sonars and altimeters in the virtual site: rate, latency, losses and transport."""
 
 import subprocess
 import sys
@@ -36,20 +36,23 @@ STILL = np.array([0.0, 0.0, -2.0]), quat_from_yaw(0.0)
 
 @pytest.fixture(scope="module")
 def wall(tmp_path_factory):
-    """A world file."""
+    """World file of a wall."""
     path = tmp_path_factory.mktemp("world") / "wall.yaml"
     path.write_text(WALL, encoding="utf-8")
     return str(path)
 
 
 def counted(pictures):
-    """How many of each source."""
+    """Count the pictures of each source."""
     names = [picture.source for picture in pictures]
     return {name: names.count(name) for name in names}
 
 
 def test_readings_come_at_their_rate_as_late_as_the_file_says(wall):
-    """10 s of a camera of 10 Hz with 0.1 s and 1 %, a sonar of 5 Hz, an altimeter of 10 Hz with 0.05 s."""
+    """In 10 s, readings of a camera, a sonar and an altimeter arrive at their rates with their latencies.
+
+    The camera has 10 Hz, 0.1 s and 1 % losses, the sonar 5 Hz, the altimeter 10 Hz and 0.05 s.
+    """
     sensors = OnboardSensors(VEHICLE, wall, seed=1)
     pictures = sensors.advance(0.0, 10.0, lambda t: STILL)
     assert counted(pictures)["sonar"] == 49 and counted(pictures)["altimeter"] == 99
@@ -61,7 +64,7 @@ def test_readings_come_at_their_rate_as_late_as_the_file_says(wall):
 
 
 def test_a_reading_is_of_the_place_at_its_exposure(wall):
-    """A vehicle that sinks at 0.1 m/s: the altimeter's range is that of 0.05 s before its arrival."""
+    """With a vehicle that sinks at 0.1 m/s, the altimeter's range is that of 0.05 s before its arrival."""
     sensors = OnboardSensors(VEHICLE, wall, names=["altimeter"])
 
     def sinking(t):
@@ -75,7 +78,7 @@ def test_a_reading_is_of_the_place_at_its_exposure(wall):
 
 
 def test_equal_seeds_see_the_same_and_others_do_not(wall):
-    """Bit for bit, whatever the lengths of the steps."""
+    """Equal seeds give bit-identical readings for any lengths of the steps; other seeds do not."""
     once, twice, other = (
         _in_steps(OnboardSensors(VEHICLE, wall, seed=seed), n) for seed, n in ((3, 1), (3, 50), (4, 1))
     )
@@ -91,7 +94,7 @@ def _in_steps(sensors, n):
 
 
 def test_the_site_takes_the_size_of_its_world(wall):
-    """Open water down to the seabed, a basin with its walls; an explicit site stays what it is."""
+    """The site is open water down to the seabed, or a basin with its walls; an explicit site stays unchanged."""
     for world, size in (("gate", (16.0, 10.0, 3.2)), (wall, (2000.0, 2000.0, 4.0))):
         basin = make_plan("finsrov", "1", "nominal", camera="none", world=world).spec.basin
         assert (basin.length, basin.width, basin.depth) == size
@@ -101,7 +104,7 @@ def test_the_site_takes_the_size_of_its_world(wall):
 
 
 def test_own_sensors_and_the_overhead_camera_go_one_way(wall):
-    """In lock-step over TCP: corners of the tags without a name, readings with theirs, equal to those made here."""
+    """In lock-step over TCP, tag corners arrive without a name and readings with theirs, equal to local ones."""
     plan = make_plan("finsrov", "1", "nominal", camera="corners", world=wall, site="pool", seed=5)
     begin = station_of("0,0,-0.5,0")
     here, there = (plan.standing(begin, seed=5) for _ in range(2))
@@ -120,7 +123,8 @@ def test_own_sensors_and_the_overhead_camera_go_one_way(wall):
 
 
 def test_the_hull_meets_the_things_of_the_world(wall):
-    """Ahead for 5 s: the nose ends at the wall 3 m ahead, within the penalty's 5 cm; unsolid, it goes on."""
+    """In 5 s ahead, the nose stops at the wall 3 m away, within the penalty's 5 cm; a wall without contact is
+    passed."""
     plan = make_plan("finsrov", "1", "nominal", camera="none", world=wall)
     nose = 0.5 * VEHICLE.body.size[0]
     ends = []

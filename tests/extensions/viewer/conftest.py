@@ -31,7 +31,7 @@ class Trial(NamedTuple):
 
 @pytest.fixture(scope="session")
 def trial(tmp_path_factory):
-    """Six seconds towards a goal, ten pictures a second."""
+    """Run of six seconds towards a goal with ten pictures a second."""
     folder = tmp_path_factory.mktemp("trial")
     vehicle = load_vehicle("finsrov")
     true_site, known, settings = camera_of(vehicle, 1, "realistic")

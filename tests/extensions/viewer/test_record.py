@@ -1,4 +1,4 @@
-"""Frames of a record are what was recorded, at any time and in any order."""
+"""Frames of a record equal the recorded messages, at any time and in any order."""
 
 from types import SimpleNamespace
 
@@ -22,7 +22,7 @@ def source(trial):
 
 
 def test_frames_are_the_recorded_messages(source, trial):
-    """Estimate, goal and forces are those of the newest messages of the time, and time can run backwards."""
+    """Estimate, goal and forces are those of the newest messages at the time, and time can run backwards."""
     with open_record(trial.record) as record:
         odom = [(e.time, e.message.pose.pose.position) for e in record.messages(["odom"])]
         states = [(e.time, e.message.force) for e in record.messages(["thruster_state"])]
@@ -37,7 +37,7 @@ def test_frames_are_the_recorded_messages(source, trial):
 
 
 def test_pictures_come_with_the_tags_in_them(source):
-    """Both tags are found in a recorded picture; a moment between two pictures shows the earlier one again."""
+    """Both tags are found in a recorded picture; between two pictures the earlier one is shown."""
     frame = source.frame(4.0)
     assert frame.picture.image.shape == (720, 1280)
     assert {tag.tag_id for tag in frame.picture.tags} == set(source.stage.vehicle.tags.mounts)
@@ -46,7 +46,7 @@ def test_pictures_come_with_the_tags_in_them(source):
 
 
 def test_the_truth_lies_under_the_estimate(source, trial):
-    """In lock-step both clocks are one: the truth of the file is shown at its own time, near the estimate."""
+    """In lock-step both clocks agree: the truth of the file is shown at its own time, near the estimate."""
     truth, frame = read_truth(trial.truth), source.frame(5.0)
     true = truth.position[np.searchsorted(truth.time, source.begin + 5.0, side="right") - 1]
     assert frame.truth.position == pytest.approx(true)
@@ -59,7 +59,7 @@ def test_the_truth_lies_under_the_estimate(source, trial):
 
 
 def test_the_covariance_is_that_of_the_estimator(source):
-    """Its greatest standard deviation is the one in the panel; a position with an unknown axis has none."""
+    """The greatest standard deviation is that of the panel; a position with an unknown axis has none."""
     frame = source.frame(5.0)
     std = 100.0 * np.sqrt(np.diag(frame.covariance)).max()
     assert frame.status["position std"] == f"{std:.1f} cm" and std > 0.0
@@ -67,7 +67,8 @@ def test_the_covariance_is_that_of_the_estimator(source):
 
 
 def test_events_of_the_whole_record_are_known_at_its_beginning(source):
-    """In order, with their times in the record; loss of vision is one, coasting between two pictures is none."""
+    """Events are in order, with their times in the record; loss of vision is one, coasting between pictures
+    is not."""
     times, texts = zip(*source.stage.events, strict=True)
     assert list(times) == sorted(times) and times[-1] <= source.duration + 0.1
     assert any(text.startswith("armed:") for text in texts) and texts[-1].startswith("disarmed:")
@@ -76,7 +77,8 @@ def test_events_of_the_whole_record_are_known_at_its_beginning(source):
 
 
 def test_clocks_are_laid_over_each_other_by_the_motion(trial, source):
-    """Truth whose clock began 123.4 s later is found to within the time in which the vehicle moves some millimetres."""
+    """A truth clock offset of 123.4 s is found to within the time in which the vehicle moves some
+    millimetres."""
     truth = read_truth(trial.truth)
     found = clock_offset(source._odom.time, source._odom.position, truth.time - 123.4, truth.position)
     assert found == pytest.approx(123.4, abs=0.1)
@@ -87,7 +89,7 @@ def test_clocks_are_laid_over_each_other_by_the_motion(trial, source):
 
 
 def test_a_damaged_truth_is_refused(trial, tmp_path):
-    """Ten bytes of the table come twice, so that all rows behind them are made of parts of two."""
+    """A table with ten bytes repeated, which misaligns all following rows, is refused."""
     damaged, data = tmp_path / "truth.fst", trial.truth.read_bytes()
     middle = len(data) // 2
     damaged.write_bytes(data[:middle] + data[middle - 10 :])
@@ -113,13 +115,13 @@ def test_the_box_is_the_pool_or_the_workspace(trial, source):
 
 
 def test_events_are_told_when_they_have_happened(source):
-    """The start of the trial is an event that is not known before."""
+    """The start of the trial is not listed before its time."""
     assert not source.frame(0.0).events
     assert any("trial_start" in line for line in source.frame(5.0).events)
 
 
 def test_a_trail_ends_where_the_body_is():
-    """The trail has what lies in the past, and of that the last half minute."""
+    """The trail covers the last half minute of the past."""
     time = np.arange(0.0, 100.0, 0.1)
     poses = PoseSeries(
         time, np.stack([time, 0 * time, 0 * time], axis=1), np.tile([0.0, 0.0, 0.0, 1.0], (1000, 1))
@@ -130,7 +132,7 @@ def test_a_trail_ends_where_the_body_is():
 
 
 def rewritten(source, target, files=None, **metadata):
-    """A record as somebody else could have made it: with other metadata and other files."""
+    """Return a record as a third party could have written it: with other metadata and other files."""
     from mcap.reader import make_reader
     from mcap.writer import Writer
 
@@ -153,7 +155,8 @@ def rewritten(source, target, files=None, **metadata):
 
 @pytest.mark.parametrize("place", ["{}/mine", "../{}/mine", "..\\mine", "", "..", "mine\0"])
 def test_the_name_of_a_vehicle_is_no_path(trial, tmp_path, monkeypatch, place):
-    """A record's own file would be written there: the user's stays as it was, and one sentence refuses the record."""
+    """A record whose file would be written outside is refused in one sentence, and the user's file stays
+    unchanged."""
     theirs = tmp_path / "home" / "mine.yaml"
     theirs.parent.mkdir()
     theirs.write_text("precious: 1\n", encoding="utf-8")
@@ -167,7 +170,7 @@ def test_the_name_of_a_vehicle_is_no_path(trial, tmp_path, monkeypatch, place):
 
 
 def test_a_record_names_vehicles_of_the_catalogue_or_keeps_their_file(trial, tmp_path, monkeypatch):
-    """A file of the user of that name is not looked at; the record's own is."""
+    """The record's own file is used, not a file of the user with the same name."""
     (tmp_path / "other.yaml").write_text(
         "extends: finsrov\norigin: measured\nsource: test\nbody: {mass: 99.0}\n", encoding="utf-8"
     )

@@ -1,4 +1,4 @@
-"""The scene that is sent to the page: what moves with a frame, and by how much."""
+"""The scene that is sent to the page: objects that move with a frame, and their displacements."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -25,14 +25,14 @@ def view():
 
 
 def node(view, name):
-    """A handle of the scene."""
+    """Return a handle of the scene."""
     handle = view.server.scene.get_handle_by_name(name)
     assert handle is not None, name
     return handle
 
 
 def frame_at(time, **values):
-    """A frame with a true pose and an estimate."""
+    """Return a frame with a true pose and an estimate."""
     pose = BodyPose(AT, quat_from_yaw(0.3))
     return ViewFrame(time=time, truth=pose, estimate=pose, **values)
 
@@ -58,7 +58,7 @@ def test_the_placeholder_shows_the_vehicle_in_its_pool(view):
 
 @pytest.mark.slow
 def test_beside_the_truth_the_estimate_is_a_net_without_thrusters(view):
-    """So that it hides nothing; alone it is the whole vehicle."""
+    """Beside the truth the estimate is a net, which hides nothing; alone it is the whole vehicle."""
     view.scene.draw(frame_at(0.0))
     hull, thrusters = (node(view, f"/estimate/{part}") for part in ("hull", "thrusters"))
     assert hull.wireframe and not thrusters.visible and node(view, "/truth/thrusters").visible
@@ -68,7 +68,10 @@ def test_beside_the_truth_the_estimate_is_a_net_without_thrusters(view):
 
 @pytest.mark.slow
 def test_the_ellipsoid_contains_the_position_with_95_percent(view):
-    """Its axes are those of the covariance, as long as a chi-square of three degrees says; none without one."""
+    """The ellipsoid's axes follow the covariance, with chi-square lengths of three degrees of freedom.
+
+    Without a covariance there is no ellipsoid.
+    """
     axes = quat_to_matrix(quat_from_yaw(0.7))
     std = np.array([0.03, 0.05, 0.08])
     view.scene.draw(frame_at(0.0, covariance=axes @ np.diag(std**2) @ axes.T))
@@ -83,7 +86,8 @@ def test_the_ellipsoid_contains_the_position_with_95_percent(view):
 
 @pytest.mark.slow
 def test_propellers_turn_with_their_thrusts(view):
-    """Forward for a positive thrust, backward for a negative one, not at all without; a pause stops them."""
+    """Propellers turn forward for a positive thrust, backward for a negative one, and stop at zero or in a
+    pause."""
     force = np.zeros(len(FINSROV.thrusters))
     force[0], force[1] = 0.5 * np.array([1.0, -1.0]) * np.max(np.abs(FINSROV.force_limits))
     view.scene.draw(frame_at(1.0, force=force))
@@ -97,7 +101,7 @@ def test_propellers_turn_with_their_thrusts(view):
 
 @pytest.mark.slow
 def test_caustics_move_with_time(view):
-    """Of all pictures of the floor exactly one is visible, another one a while later."""
+    """Exactly one picture of the floor is visible at a time, and another one later."""
     seen = []
     for k in range(20):
         view.scene.draw(frame_at(0.2 * k))
@@ -107,7 +111,7 @@ def test_caustics_move_with_time(view):
 
 @pytest.mark.slow
 def test_the_trail_fades_with_its_age(view):
-    """Its newest end has its full colour, its oldest nearly that of the water."""
+    """The newest end of the trail has its full colour, the oldest nearly that of the water."""
     view.scene.draw(frame_at(0.0, trail=np.linspace(AT - 1.0, AT, 12)))
     colours = node(view, "/trail").colors.astype(int)
     assert colours.shape == (11, 2, 3)
@@ -116,7 +120,7 @@ def test_the_trail_fades_with_its_age(view):
 
 @pytest.mark.slow
 def test_a_source_replaces_the_placeholder(view):
-    """The page shows the new stage alone, from its beginning."""
+    """The page shows only the new stage, from its beginning."""
     other = Placeholder(load_vehicle("torpedo"), "another", "")
     other.stage = replace(other.stage, walls=False)
     view.turn(0.05)
@@ -131,7 +135,7 @@ def test_a_source_replaces_the_placeholder(view):
 
 @pytest.mark.slow
 def test_a_phone_sees_the_water_from_farther_away(view):
-    """A narrow picture is taken from a greater distance, a wide one from the usual."""
+    """A narrow window is viewed from a greater distance, a wide one from the usual distance."""
 
     def distance(aspect):
         camera = SimpleNamespace()
@@ -146,7 +150,8 @@ def test_a_phone_sees_the_water_from_farther_away(view):
 @pytest.mark.slow
 @pytest.mark.parametrize("name, thrusters, fins", [("slocum", 0, 1), ("eca_a9", 1, 4), ("rexrov", 8, 0)])
 def test_vehicles_of_every_build_are_drawn(view, name, thrusters, fins):
-    """A glider without propeller, a torpedo with fins and one propeller, a vehicle with a mesh of its own."""
+    """A glider without propeller, a torpedo with fins and one propeller, and a vehicle with its own mesh are
+    drawn."""
     view.show(Placeholder(load_vehicle(name), name, ""))
     view.turn(0.05)
     propellers = view.server.scene.get_handle_by_name("/truth/thrusters/propellers")

@@ -1,4 +1,4 @@
-"""What is drawn has the size and the place of what is meant."""
+"""Drawn shapes have the sizes and positions of the objects that they represent."""
 
 import numpy as np
 import pytest
@@ -24,13 +24,13 @@ FINSROV = load_vehicle("finsrov")
 
 
 def volume(mesh):
-    """Of a closed mesh, by the divergence theorem: sum of a . (b x c) / 6."""
+    """Return the volume of a closed mesh by the divergence theorem: sum of a . (b x c) / 6."""
     a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
     return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6.0)
 
 
 def test_arrows_push_where_thrusters_push():
-    """Full thrust forward has the full length along the turned axis; nothing is drawn for no thrust."""
+    """Full forward thrust has the full length along the turned axis; zero thrust has no arrow."""
     force = np.zeros(len(FINSROV.thruster_names))
     force[0] = -np.max(np.abs(FINSROV.force_limits))
     pose = BodyPose(np.array([1.0, 2.0, -0.5]), quat_from_yaw(np.pi / 2))
@@ -44,7 +44,7 @@ def test_arrows_push_where_thrusters_push():
 
 
 def test_a_vehicle_without_a_hull_is_a_body_of_its_size_and_volume():
-    """It is closed and faces outwards; of a volume that exceeds the size there is the box."""
+    """The body is closed and faces outwards; a volume that exceeds the size gives the box."""
     bare = load_vehicle("remus100")
     assert bare.hull is None
     hull = hull_of(bare)
@@ -56,7 +56,8 @@ def test_a_vehicle_without_a_hull_is_a_body_of_its_size_and_volume():
 
 
 def test_propellers_turn_about_the_axes_of_their_thrusters():
-    """z lies along the thrust's axis at every angle; a quarter turn carries a blade to where the next axis was."""
+    """z lies along the thrust axis at every angle; a quarter turn moves a blade to the previous position of
+    the next axis."""
     n = len(FINSROV.thrusters)
     begin, places, radii = propeller_poses(FINSROV, np.zeros(n))
     turned, *_ = propeller_poses(FINSROV, np.full(n, 0.5 * np.pi))
@@ -82,7 +83,8 @@ def test_a_line_leaves_out_what_is_unknown():
 
 
 def test_tags_are_outlined_where_they_were_found():
-    """The outline is on the corners, the enlarged part beside; a tag at the border or of NaN hurts nobody."""
+    """The outline follows the corners, with the enlarged tag beside it; a tag at the border or of NaN is
+    harmless."""
     image = np.full((720, 1280), 90, np.uint8)
     corners = np.array([[600.0, 300.0], [640.0, 300.0], [640.0, 340.0], [600.0, 340.0]])
     plain, drawn = (
@@ -99,7 +101,7 @@ def test_tags_are_outlined_where_they_were_found():
 
 
 def test_plots_show_the_past_in_full():
-    """Curves of one title stand in one plot; of each, the part up to now is drawn again."""
+    """Curves of one title share a plot; the part of each up to now is highlighted."""
     time = np.arange(5.0)
     curves = [
         PlotLine("a", "x", time, time),
@@ -115,7 +117,8 @@ def test_plots_show_the_past_in_full():
 
 
 def test_a_plot_begins_where_all_its_curves_have_values():
-    """The first estimate comes later than the first distance to the goal; the browser draws nothing from a NaN on."""
+    """The first estimate comes later than the first distance to the goal, and the browser draws nothing after
+    a NaN."""
     time, late = np.arange(4.0), np.array([np.nan, 2.0, 3.0, 4.0])
     curves = [
         PlotLine("position", "to the goal", time, time),
@@ -128,7 +131,8 @@ def test_a_plot_begins_where_all_its_curves_have_values():
 
 
 def test_fins_are_plates_that_turn_with_their_deflection():
-    """Of the fin's area, in the plane of chord and span; a positive deflection turns it about the span."""
+    """A plate has the fin's area in the plane of chord and span; a positive deflection turns it about the
+    span."""
     vehicle = torpedo()
     plates = fin_plates(vehicle)
     assert list(plates) == [0, 1]

@@ -1,4 +1,4 @@
-"""Live sources go on, recorded ones can be read anywhere, and every option changes what is seen."""
+"""Live sources advance, recorded ones can be read at any time, and every option has an effect."""
 
 import json
 import math
@@ -20,7 +20,7 @@ from finssim.vehicles import VehicleError, load_vehicle
 
 
 def test_the_pool_lives_and_the_robot_in_it_goes_to_the_goal():
-    """Truth and estimate are both shown, near each other, and nearer to the goal in time; equal seeds begin alike."""
+    """Truth and estimate are shown close together and approach the goal; equal seeds begin alike."""
     source = open_source(SourceChoice(source="pool", goal="0.5,0.2,-0.6,20"))
     first = source.frame(0.1)
     assert math.isinf(source.duration) and first.time == pytest.approx(0.1)
@@ -38,7 +38,7 @@ def test_the_pool_lives_and_the_robot_in_it_goes_to_the_goal():
 
 @pytest.mark.slow
 def test_the_pool_is_the_one_that_was_asked_for():
-    """Plant, severity, policy, trajectory and vehicle are heeded."""
+    """Plant, severity, policy, trajectory and vehicle are those requested."""
     plain = open_source(SourceChoice(trajectory="ellipse", camera="pictures"))
     assert isinstance(plain, PoolSource) and "realistic plant 1: pid, ellipse" in plain.stage.title
     assert len(plain.stage.path) > 100 and plain.frame(0.3).picture.image.shape == (720, 1280)
@@ -47,7 +47,7 @@ def test_the_pool_is_the_one_that_was_asked_for():
 
 
 def test_the_simulator_is_a_source(tmp_path):
-    """It holds a station from its state alone, in the model that was asked for."""
+    """The simulator holds a station from its true state, in the requested model."""
     source = open_source(SourceChoice(source="sim", goal="0.3,0.1,-0.6,30"))
     assert isinstance(source, SimulatorSource)
     frame = source.frame(10.0)
@@ -74,7 +74,7 @@ def test_a_run_of_the_engine_is_a_source(tmp_path):
 
 @pytest.mark.parametrize("name", ["{}/mine", "../mine", "mine.yaml", "mine"])
 def test_the_vehicle_that_a_run_names_is_of_the_catalogue(tmp_path, monkeypatch, name):
-    """A file of that name is not looked at."""
+    """The catalogue's vehicle is used, not a file of the same name."""
     (tmp_path / "mine.yaml").write_text("extends: finsrov\n", encoding="utf-8")
     simulator = Simulator("finsrov")
     with StateRecorder(simulator, tmp_path / "run") as recorder:
@@ -99,7 +99,7 @@ def test_the_vehicle_that_a_run_names_is_of_the_catalogue(tmp_path, monkeypatch,
     ],
 )
 def test_what_cannot_be_shown_is_refused_in_a_sentence(choice, sentence):
-    """The sentence says what to do instead."""
+    """The message states what to do instead."""
     with pytest.raises(ValueError, match=sentence):
         open_source(choice)
 
@@ -107,20 +107,21 @@ def test_what_cannot_be_shown_is_refused_in_a_sentence(choice, sentence):
 @pytest.mark.slow
 @pytest.mark.parametrize("basin", ["4,2", "4,2,0", "a,b,c"])
 def test_a_pool_has_three_lengths(trial, basin):
-    """Length, width and depth above zero."""
+    """A pool needs length, width and depth above zero."""
     with pytest.raises(ViewError, match=r"expected length,width,depth"):
         open_source(SourceChoice(source=str(trial.record), basin=basin))
 
 
 def test_a_record_may_be_shown_with_another_vehicle(trial):
-    """--vehicle overrides what the record says."""
+    """--vehicle overrides the vehicle of the record."""
     assert open_source(SourceChoice(source=str(trial.record))).stage.vehicle.name == "finsrov"
     other = open_source(SourceChoice(source=str(trial.record), vehicle="bluerov2_heavy"))
     assert other.stage.vehicle.name == load_vehicle("bluerov2_heavy").name
 
 
 def test_a_world_is_seen_heard_and_drawn():
-    """The pool with a world: its things stand where they were drawn, pictures and a fan come, ranges are told."""
+    """In a pool with a world, objects stand where they were drawn; pictures, a sonar fan and ranges are
+    shown."""
     pytest.importorskip("newton", reason="finssim[perception] is not installed")
     source = open_source(SourceChoice(source="pool", world="dock", seed=3))
     layout = WorldLayout("dock")
@@ -140,7 +141,7 @@ def test_a_world_is_seen_heard_and_drawn():
 
 
 def test_a_record_shows_own_sensors_and_the_world_that_is_named(tmp_path):
-    """Pictures in colour, fans, ranges; nothing of them once they are old."""
+    """Colour pictures, sonar fans and ranges of a record are shown until they are outdated."""
     vehicle, path = load_vehicle("finsrov"), tmp_path / "run.mcap"
     image = np.zeros((36, 64, 3), np.uint8)
     image[..., 0] = 200

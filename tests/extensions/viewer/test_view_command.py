@@ -1,4 +1,4 @@
-"""`finssim view` serves its page to this machine and ends with Ctrl-C."""
+"""`finssim view` serves its page to this machine only and ends with Ctrl-C."""
 
 import os
 import re
@@ -14,7 +14,7 @@ from websockets.sync.client import connect
 
 
 def start(*words, **environment):
-    """The command in a process of its own, and the address that it prints."""
+    """Start the command in its own process and return it with the address that it prints."""
     run = subprocess.Popen(
         [sys.executable, "-m", "finssim", "view", *map(str, words), "--no-browser"],
         stdout=subprocess.PIPE,
@@ -30,7 +30,7 @@ def start(*words, **environment):
 
 @pytest.mark.slow
 def test_the_page_is_served_until_control_c(trial):
-    """The printed address answers; Ctrl-C ends with 0 and says nothing more."""
+    """The printed address answers; Ctrl-C ends the command with status 0 and no further output."""
     run, url = start(trial.record, "--truth", trial.truth, "--port", "8240")
     with urllib.request.urlopen(url, timeout=60.0) as answer:
         assert answer.status == 200 and b"<html" in answer.read()
@@ -41,8 +41,10 @@ def test_the_page_is_served_until_control_c(trial):
 
 @pytest.mark.slow
 def test_the_vehicle_is_shown_before_kernels_are_compiled(tmp_path):
-    """With an empty cache the page gets the vehicle, the pool and a notice while no kernel has been compiled; Ctrl-C
-    then ends the command before all are."""
+    """With an empty cache the page shows the vehicle, the pool and a notice before any kernel is compiled.
+
+    Ctrl-C then ends the command before all kernels are compiled.
+    """
     run, url = start("pool", "--port", "8242", WARP_CACHE_PATH=str(tmp_path))
     try:
         options = {"subprotocols": [f"viser-v{viser.__version__}"], "additional_headers": {"Origin": url}}
@@ -65,7 +67,7 @@ def test_the_vehicle_is_shown_before_kernels_are_compiled(tmp_path):
 
 @pytest.mark.slow
 def test_a_live_pool_ends_by_itself():
-    """--duration ends it, and --port and --speed are taken."""
+    """--duration ends a live pool; --port and --speed are accepted."""
     run, url = start("pool", "--goal", "0.2,0,-0.5,0", "--port", "8241", "--speed", "4", "--duration", "2")
     assert re.search(r":82\d\d$", url)
     out, _ = run.communicate(timeout=120.0)

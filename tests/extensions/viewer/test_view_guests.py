@@ -1,4 +1,4 @@
-"""Who may connect to the page: the page itself, and no other that a browser shows."""
+"""Connections to the page: only the page itself may connect, no other page that a browser shows."""
 
 import socket
 import urllib.error
@@ -15,14 +15,14 @@ from finssim.extensions.viewer.sources import RecordSource
 
 @pytest.fixture(scope="module")
 def port(trial):
-    """Of a page that is served."""
+    """Port of a served page."""
     view = View(RecordSource(trial.record), port=8260, playing=False)
     yield view.server.get_port()
     view.close()
 
 
 def opened(port, host, origin):
-    """The WebSocket's first message, or the status of its refusal; the connection itself goes to this machine."""
+    """Return the WebSocket's first message or the status of its refusal; the connection goes to this machine."""
     options = {
         "subprotocols": [f"viser-v{viser.__version__}"],
         "additional_headers": {} if origin is None else {"Origin": origin},
@@ -37,7 +37,8 @@ def opened(port, host, origin):
 
 @pytest.mark.slow
 def test_only_the_served_page_may_connect(port):
-    """The page's own WebSocket gets the scene; one of another site, of a name led here or without one gets 403."""
+    """The page's WebSocket gets the scene; one of another site, of a rebound name or without an origin gets
+    403."""
     own = f"localhost:{port}"
     assert isinstance(opened(port, own, f"http://{own}"), bytes)
     assert isinstance(opened(port, f"127.0.0.1:{port}", f"http://127.0.0.1:{port}"), bytes)
@@ -55,7 +56,7 @@ def test_only_the_served_page_may_connect(port):
 
 @pytest.mark.slow
 def test_the_page_is_served_under_names_of_this_machine_alone(port):
-    """A name that another site led here gets no page either."""
+    """A request under another name that resolves to this machine gets no page."""
     for host, status in (
         (f"localhost:{port}", 200),
         (f"127.0.0.1:{port}", 200),
@@ -72,7 +73,7 @@ def test_the_page_is_served_under_names_of_this_machine_alone(port):
 
 @pytest.mark.slow
 def test_the_page_has_its_own_title_and_icon(port):
-    """viser's do not remain in it."""
+    """The title and icon of viser are replaced."""
     with urllib.request.urlopen(f"http://127.0.0.1:{port}/", timeout=30.0) as answer:
         head = answer.read(4000).decode()
     assert "<title>FinsSim view</title>" in head and "fill='%230072B2'" in head

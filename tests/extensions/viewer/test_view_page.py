@@ -1,4 +1,4 @@
-"""The page in a real browser: it plays, draws the vehicle where it is, and the slider moves it."""
+"""The page in a real browser: it plays, draws the vehicle at its pose, and follows the slider."""
 
 import shutil
 import time
@@ -14,12 +14,12 @@ from finssim.extensions.viewer.sources import RecordSource
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 SOFTWARE = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 PATIENCE = 120.0
-"""Software rendering on a busy machine takes its time [s]."""
+"""Time limit for software rendering on a busy machine [s]."""
 
 
 @pytest.fixture
 def view(trial):
-    """A page of the record, standing at its beginning."""
+    """Page of the record, paused at its beginning."""
     view = View(
         RecordSource(trial.record, truth=trial.truth, basin=(4.0, 2.0, 1.0)), port=8230, playing=False
     )
@@ -38,18 +38,18 @@ def page(view):
         page.set_default_timeout(1e3 * PATIENCE)
         page.goto(view.url)
         page.wait_for_selector("canvas")
-        page.locator(".mantine-Notification-closeButton").first.click()  # that it renders without a GPU
+        page.locator(".mantine-Notification-closeButton").first.click()  # renders without a GPU
         yield page
         browser.close()
 
 
 def shot(page):
-    """What is on the page, (h, w, 3) BGR."""
+    """Return a screenshot of the page, (h, w, 3) BGR."""
     return cv2.imdecode(np.frombuffer(page.screenshot(), np.uint8), cv2.IMREAD_COLOR)
 
 
 def place_of(view, position):
-    """Where on the page a point of the world is drawn [px]."""
+    """Return the position on the page of a point of the world [px]."""
     (client,) = view.server.get_clients().values()
     camera = client.camera
     w, x, y, z = camera.wxyz
@@ -59,7 +59,7 @@ def place_of(view, position):
 
 
 def orange_near(picture, place, reach=45):
-    """How many pixels around a place have the colour of the true vehicle."""
+    """Return the number of pixels around a position that have the colour of the true vehicle."""
     x, y = place.round().astype(int)
     part = picture[max(y - reach, 0) : y + reach, max(x - reach, 0) : x + reach].astype(int)
     blue, green, red = np.moveaxis(part, 2, 0)
@@ -67,7 +67,7 @@ def orange_near(picture, place, reach=45):
 
 
 def until(view, page, holds):
-    """Turn the loop and look at the page until it shows what it should; returns the picture."""
+    """Turn the loop until the page fulfils the condition, and return the picture."""
     end = time.monotonic() + PATIENCE
     while time.monotonic() < end:
         view.turn(0.6)
@@ -78,7 +78,7 @@ def until(view, page, holds):
 
 
 def wait(holds):
-    """Until something is true that another thread brings about."""
+    """Wait until another thread makes a condition true."""
     end = time.monotonic() + PATIENCE
     while not holds():
         assert time.monotonic() < end
@@ -88,7 +88,10 @@ def wait(holds):
 @pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Debian's chromium")
 def test_the_vehicle_is_drawn_where_it_is_and_moves_with_the_slider(view, page):
-    """Hundreds of colours; truth-coloured pixels where the pose projects to; at the slider's end they are elsewhere."""
+    """The page has hundreds of colours, and truth-coloured pixels at the projected pose.
+
+    At the slider's end they are elsewhere.
+    """
     page.get_by_role("button", name="play").click()
     wait(lambda: view.playback.playing)
     view.turn(0.6)
@@ -120,7 +123,7 @@ def test_the_vehicle_is_drawn_where_it_is_and_moves_with_the_slider(view, page):
 @pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Debian's chromium")
 def test_on_a_phone_the_panel_lies_below_the_scene(page):
-    """It is as wide as the page and at most half as high; a tap on its head leaves the head alone."""
+    """The panel is as wide as the page and at most half as high; a tap on its head collapses it to the head."""
     page.set_viewport_size({"width": 390, "height": 844})
     panel = page.locator(".mantine-Paper-root[style*='fixed']")
     panel.wait_for()
