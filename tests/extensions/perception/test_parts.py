@@ -1,4 +1,4 @@
-"""Models of other programs as parts of a world: where their shapes are, how large, and what is refused."""
+"""Models of other programs as parts of a world: position and scale of their shapes, and refusals."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,8 @@ def write(folder, name, text):
 
 @pytest.mark.slow
 def test_an_mjcf_is_its_geoms_at_rest(tmp_path):
-    """A turned box, a capsule between two points, and a mesh that MuJoCo has moved to its centre of mass."""
+    """A turned box, a capsule between two points and a mesh moved to its centre of mass are at their rest
+    poses."""
     pytest.importorskip("mujoco")
     mesh, box, capsule = parts_of(write(tmp_path, "rack.xml", MJCF))
     assert [part.kind for part in (mesh, box, capsule)] == ["mesh", "box", "capsule"]
@@ -44,7 +45,7 @@ def test_an_mjcf_is_its_geoms_at_rest(tmp_path):
 
 @pytest.mark.slow
 def test_a_urdf_is_its_collision_shapes(tmp_path):
-    """A cylinder that lies along y, 0.4 m up."""
+    """A cylinder lies along y, 0.4 m up."""
     pytest.importorskip("mujoco")
     (part,) = parts_of(write(tmp_path, "buoy.urdf", URDF))
     assert part.kind == "cylinder" and part.size[:2] == pytest.approx((0.2, 0.5))
@@ -54,7 +55,8 @@ def test_a_urdf_is_its_collision_shapes(tmp_path):
 
 @pytest.mark.slow
 def test_a_model_stands_in_a_world_with_its_own_colours(tmp_path):
-    """Twice as large, moved and turned as its object; a colour of the world file comes before the model's."""
+    """A model is scaled by two, moved and turned as its object; a colour of the world file overrides the
+    model's."""
     pytest.importorskip("mujoco")
     write(tmp_path, "rack.xml", MJCF)
     text = WATER + (
@@ -75,7 +77,7 @@ def test_a_model_stands_in_a_world_with_its_own_colours(tmp_path):
 
 
 def test_files_outside_the_folder_are_refused_however_they_are_named(tmp_path):
-    """By a file that the model includes."""
+    """A file outside the folder is refused in a file that the model includes, too."""
     pytest.importorskip("mujoco")
     (tmp_path / "own").mkdir()
     write(tmp_path / "own", "more.xml", "<mujoco><asset><mesh file='../secret.stl'/></asset></mujoco>")
@@ -91,7 +93,7 @@ SHAPE = "<worldbody><geom type='sphere' size='0.1'/></worldbody>"
     "key", ["model name='s'", "mesh name='s'", "texture type='cube' fileup='a.png' name='s'"]
 )
 def test_files_that_a_model_reaches_through_another_are_of_its_folder(tmp_path, key):
-    """A model in a model names its own folder of meshes, outside of this one; a link leads there."""
+    """A nested model that names its own mesh folder outside, or a link that leads there, is refused."""
     pytest.importorskip("mujoco")
     (tmp_path / "own").mkdir()
     inner = (
@@ -109,7 +111,7 @@ def test_files_that_a_model_reaches_through_another_are_of_its_folder(tmp_path, 
 
 @pytest.mark.slow
 def test_a_model_may_name_files_of_its_folder_and_below(tmp_path):
-    """A file that it includes, and in a folder below a mesh, of which another model has a copy."""
+    """An included file and a mesh in a subfolder, which another model copies, are accepted."""
     pytest.importorskip("mujoco")
     (tmp_path / "meshes").mkdir()
     write_stl(tmp_path / "meshes" / "a.stl", np.eye(4, 3, k=-1), [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)])
@@ -130,7 +132,7 @@ def test_a_model_may_name_files_of_its_folder_and_below(tmp_path):
     "times, deep, sentence", [(2, 25, "more than 100000 elements"), (1, 1500, "50 deep")]
 )
 def test_includes_of_includes_are_counted_before_any_is_followed(tmp_path, times, deep, sentence):
-    """2^25 elements in 25 files, and a chain of 1500 files."""
+    """2^25 elements in 25 files and a chain of 1500 files are refused."""
     for i in range(deep):
         write(
             tmp_path,
@@ -164,7 +166,7 @@ def test_includes_of_includes_are_counted_before_any_is_followed(tmp_path, times
     ],
 )
 def test_a_model_that_takes_too_much_is_refused(tmp_path, text, sentence):
-    """A height field of 3.6 GB, and numbers without bounds."""
+    """A height field of 3.6 GB and unbounded numbers are refused."""
     pytest.importorskip("mujoco")
     with pytest.raises(PartsError, match=sentence):
         parts_of(write(tmp_path, "rack.xml", f"<mujoco>{text}</mujoco>"))
@@ -186,7 +188,7 @@ def test_a_model_that_takes_too_much_is_refused(tmp_path, text, sentence):
     ],
 )
 def test_a_model_that_cannot_be_used_is_refused(tmp_path, text, sentence):
-    """One sentence with the object and the file."""
+    """The message is one sentence with the object and the file."""
     pytest.importorskip("mujoco")
     write(tmp_path, "rack.xml", text)
     site = (

@@ -1,4 +1,4 @@
-"""Pictures and tags on shapes, blur, marine snow, water types: what a camera makes of them."""
+"""Camera images of pictures and tags on shapes, motion blur, marine snow and water types."""
 
 import math
 
@@ -41,12 +41,12 @@ SIDES = {
     "south": ((0.0, -2.5, 0.0), (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5))),
     "north": ((0.0, 2.5, 0.0), (0.0, 0.0, -math.sqrt(0.5), math.sqrt(0.5))),
 }
-"""Where a camera stands before each side of a box, and its attitude."""
+"""Camera position and attitude before each side of a box."""
 
 
 @pytest.mark.parametrize("side", SIDES)
 def test_a_tag_stands_upright_on_every_side(side, tmp_path):
-    """OpenCV's own detector finds its number, and its corners within 0.5 px of where they project, in order."""
+    """OpenCV's detector finds the tag's number and, in order, its corners within 0.5 px of their projections."""
     batch = make(tmp_path, PLATE.format("{kind: tag, tag: 23, size: 0.6}"))
     position, attitude = SIDES[side]
     sensor = CameraBatch(batch, camera())
@@ -62,7 +62,8 @@ def test_a_tag_stands_upright_on_every_side(side, tmp_path):
 
 
 def test_a_picture_keeps_its_colours_and_proportions(tmp_path):
-    """Red above blue, half as high as wide, on a black face under even light: reflectances to 2 %, edges to a pixel."""
+    """Red lies above blue at half the width on a black face: reflectances to 2 % in even light, edges to a
+    pixel."""
     board = np.zeros((60, 120, 3), np.uint8)
     board[:30, :, 2], board[30:, :, 0] = 200, 200  # OpenCV's order is blue, green, red
     cv2.imwrite(str(tmp_path / "board.png"), board)
@@ -70,7 +71,7 @@ def test_a_picture_keeps_its_colours_and_proportions(tmp_path):
     sensor = CameraBatch(batch, camera(), linear=True)
     sensor.update(pose((-2.5, 0, -5)))
     radiance = sensor.radiance.numpy()[0]
-    level = 0.5 * (200 / 255) ** 2.2  # of a wall, which sees half the light from above
+    level = 0.5 * (200 / 255) ** 2.2  # of a wall, which receives half the light from above
     np.testing.assert_allclose(radiance[90, 100], [level, 0, 0], atol=0.02 * level)
     np.testing.assert_allclose(radiance[110, 100], [0, 0, level], atol=0.02 * level)
     rows, columns = np.nonzero(radiance.sum(axis=-1) > 0.5 * level)
@@ -78,7 +79,7 @@ def test_a_picture_keeps_its_colours_and_proportions(tmp_path):
 
 
 def test_textures_that_cannot_be_are_refused(tmp_path):
-    """No file, a file that is none, a tag that its family does not have."""
+    """A missing file, a file that is not a picture and a tag that its family lacks are refused."""
     with pytest.raises(
         WorldError, match=r"texture: file is for kind: picture, which needs it; kind is picture"
     ):
@@ -99,7 +100,8 @@ def test_textures_that_cannot_be_are_refused(tmp_path):
 
 
 def test_blur_is_the_mean_of_the_exposure(tmp_path):
-    """A vehicle that moves and turns: the mean of five pictures on its way; at rest, the sharp picture bit by bit."""
+    """The picture of a moving, turning vehicle is the mean of five along its path; at rest it is exactly the
+    sharp one."""
     batch = make(tmp_path, PLATE.format("{kind: tag, tag: 23, size: 0.6}"))
     nu = np.array([0.1, 0.8, -0.2, 0.0, 0.3, 0.5])
     sharp = CameraBatch(batch, camera(), linear=True)
@@ -126,7 +128,8 @@ def test_blur_is_the_mean_of_the_exposure(tmp_path):
 
 @pytest.mark.parametrize(("density", "size"), [(50.0, 0.01), (400.0, 0.003)])
 def test_snow_covers_what_its_density_and_size_say(density, size, tmp_path):
-    """Over all pixels, rho pi a² times the way through twenty cells; 0.4 as bright as white paper."""
+    """Over all pixels the cover is rho pi a² times the path through twenty cells; 0.4 as bright as white
+    paper."""
     batch = make(tmp_path, "", CLEAR + f", snow: {{density: {density}, size: {size}}}")
     sensor = CameraBatch(batch, camera(width=400, focal_length=300.0), linear=True)
     bright = []
@@ -139,7 +142,10 @@ def test_snow_covers_what_its_density_and_size_say(density, size, tmp_path):
 
 
 def test_water_types_give_what_is_not_given():
-    """Jerlov's K_d, 1.5 times it for a beam; blue goes from clearest to most turbid; a key of one's own stands."""
+    """Omitted keys become Jerlov's K_d, and 1.5 times it for a beam; a given key is kept.
+
+    Blue decreases from the clearest type to the most turbid.
+    """
     for name, K_d in JERLOV.items():
         water = WorldWater(jerlov=name, veil=[0.1, 0.2, 0.2])
         np.testing.assert_allclose(water.daylight_attenuation, K_d)

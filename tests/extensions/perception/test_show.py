@@ -18,14 +18,15 @@ def finssim(*words):
 
 
 def test_every_site_and_sensor_is_listed(capsys):
-    """By name, with what it is."""
+    """Each entry has a name and a description."""
     assert finssim("worlds") == 0
     out = capsys.readouterr().out
     assert all(name in out for name in (*sites(), *devices()))
 
 
 def test_a_fan_shows_each_echo_where_it_is():
-    """A cell of one beam lands at its azimuth and range: left of the middle for positive azimuth, as y points left."""
+    """A beam's cell lands at its azimuth and range: left of the middle for positive azimuth, as y points
+    left."""
     sector, side = math.radians(120.0), 400
     levels = np.zeros((60, 40))
     levels[10, 29] = 1.0  # azimuth 60° - 21° = 39°, range 0.7375
@@ -38,7 +39,7 @@ def test_a_fan_shows_each_echo_where_it_is():
 
 
 def test_what_is_no_camera_or_no_picture_is_refused(capsys, tmp_path):
-    """One sentence each."""
+    """A sensor that is not a camera and an output that is not a picture are refused in one sentence each."""
     assert finssim("worlds", "show", "pool", "--camera", "ping") == 2
     assert "expected a camera and an imaging sonar" in capsys.readouterr().err
     assert finssim("worlds", "show", "pool", "--out", tmp_path / "pool.doc") == 2
@@ -49,7 +50,7 @@ def test_what_is_no_camera_or_no_picture_is_refused(capsys, tmp_path):
 
 @pytest.mark.slow
 def test_a_site_is_drawn(capsys, tmp_path, monkeypatch):
-    """What camera and sonar see, side by side, beside the numbers of the site."""
+    """Images of camera and sonar are drawn side by side, with the numbers of the site."""
     pytest.importorskip("newton", reason="finssim[perception] is not installed")
     from finssim.extensions.perception import show as worlds_show
 
@@ -60,7 +61,7 @@ def test_a_site_is_drawn(capsys, tmp_path, monkeypatch):
 
 
 def test_without_newton_the_extra_is_named(capsys, tmp_path, monkeypatch):
-    """Worlds are read without it; to see them, the sentence says what to install."""
+    """Worlds are read without Newton; rendering them is refused with the extra to install."""
     monkeypatch.setitem(sys.modules, "newton", None)
     assert finssim("worlds", "show", "pool") == 0
     assert finssim("worlds", "show", "pool", "--out", tmp_path / "pool.png") == 2

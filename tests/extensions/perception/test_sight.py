@@ -1,4 +1,4 @@
-"""Tasks that see: worlds drawn by episode, pictures at their rate, and docking by camera."""
+"""Tasks with cameras: worlds drawn by episode, pictures at their rate, and docking by camera."""
 
 from dataclasses import replace
 
@@ -36,7 +36,7 @@ def test_pictures_come_with_the_row_and_the_goal_is_the_dock_of_the_world():
     dock = env.sight.batch.poses("dock")
     np.testing.assert_allclose(env.arrays.goal_position.numpy(), dock[:, :3], atol=1e-6)
     np.testing.assert_allclose(env.arrays.goal_quaternion.numpy(), dock[:, 3:], atol=1e-6)
-    assert np.ptp(dock[:, 0]) > 0.05  # each world has a dock of its own
+    assert np.ptp(dock[:, 0]) > 0.05  # each world has its own dock
 
 
 def test_the_row_tells_attitude_velocity_and_depth_and_the_teacher_where_the_dock_is():
@@ -55,7 +55,7 @@ def test_the_row_tells_attitude_velocity_and_depth_and_the_teacher_where_the_doc
 
 def test_a_world_is_drawn_anew_where_an_episode_ends_and_its_last_picture_is_kept():
     env = Environment(SHORT, worlds=4, seed=2)
-    env.simulator.state.steps.assign(np.array([0, 3, 0, 3], np.int32))  # two end sooner
+    env.simulator.state.steps.assign(np.array([0, 3, 0, 3], np.int32))  # two episodes end earlier
     before, action = env.sight.batch.drawn.copy(), np.zeros((4, 6))
     for _ in range(3):
         seen = env.step(action)
@@ -90,7 +90,7 @@ def test_a_run_goes_on_from_a_saved_state_with_the_same_pictures():
     for _ in range(4):
         one.step(action)
     other.load_state(one.state())
-    for _ in range(5):  # over the end of an episode
+    for _ in range(5):  # past the end of an episode
         a, b = one.step(action), other.step(action)
         for name in ("state", "front_camera"):
             np.testing.assert_array_equal(a.observation[name], b.observation[name])
@@ -139,19 +139,20 @@ def test_the_teachers_task_is_a_task_of_numbers():
     env = Environment(task, worlds=256, seed=2)
     step = env.step(np.zeros((256, 6)))
     assert step.observation.shape == (256, 19)
-    assert np.abs(env.simulator.state.velocity.numpy()).max() < 0.5  # nobody starts in a wall
+    assert np.abs(env.simulator.state.velocity.numpy()).max() < 0.5  # no vehicle starts in a wall
 
 
 SERVOS = {
     "lights of the dock": (replace(CameraDocking(), turn=0.1, start=(3.0, 4.5)), LightServo, 0.6, 0.08, 12.0),
     "posts of the gate": (Gate(), PostServo, 0.5, 0.1, 15.0),
 }
-"""Task, baseline, share of pictures, and median errors of the place over the distance and of the heading [deg]."""
+"""Task, baseline, share of pictures, and median errors of relative position and heading [deg]."""
 
 
 @pytest.mark.parametrize("name", SERVOS)
 def test_a_baseline_finds_lights_or_posts_in_the_picture(name):
-    """Where it sees all of them, their middle and heading are right to the limits of the table in the median."""
+    """In pictures that show all of them, the median errors of their middle and heading are within the table's
+    limits."""
     task, kind, share, far, turn = SERVOS[name]
     env = Environment(task, worlds=32, seed=6)
     observation, servo = env.reset(), kind.for_vehicle(env.nominal[0])
@@ -176,7 +177,7 @@ def test_the_plant_of_held_out_looks_is_for_tasks_that_see():
 
 
 def test_the_line_of_the_pipeline_is_where_its_pipes_are():
-    """At the start a vehicle is over a pipe of the world, as its own objects say, and the teacher's way ends there."""
+    """A vehicle starts over a pipe of the world's objects, and the teacher's path ends on it."""
     env = make("pipeline", worlds=16, seed=4)
     world, x = env.sight.batch.world, env.simulator.state.position.numpy()[:, 0]
     line = env.sight.batch.poses("line")
@@ -205,7 +206,7 @@ def test_who_stays_behind_has_not_followed_the_pipeline_and_who_drifts_off_has_l
 
 
 def test_the_line_follower_finds_the_pipe_in_the_picture():
-    """In the file's own water the pipe's side and slope are right to 0.4 m and 12° in the median."""
+    """In the file's own water the median errors of the pipe's side and slope are within 0.4 m and 12°."""
     env = Environment(Pipeline(), worlds=24, seed=5)
     observation = env.reset()
     follower = LineFollower.for_vehicle(env.nominal[0])
@@ -221,7 +222,8 @@ def test_the_line_follower_finds_the_pipe_in_the_picture():
 
 
 def stepped(task, position, yaw=0.0):
-    """Metrics and steps after one control step from rest at places in the goal's axes [m], (worlds, 3)."""
+    """Return metrics and steps after one control step from rest at positions in the goal's axes [m], (worlds,
+    3)."""
     worlds = len(position)
     env = Environment(task, worlds=worlds, seed=1, auto_reset=False)
     goal, q = env.arrays.goal_position.numpy().copy(), env.arrays.goal_quaternion.numpy().copy()
@@ -233,11 +235,12 @@ def stepped(task, position, yaw=0.0):
 
 
 def test_a_gate_is_passed_between_its_posts_and_a_bar_is_touched_where_the_envelope_meets_it():
-    """Behind it in the middle, beside a post, at a post, turned into one, in front of it, below the posts' ends."""
+    """Cases: behind it in the middle, beside a post, at a post, turned into one, in front of it, below the
+    posts' ends."""
     task = Gate().for_teacher()
     check_task(task)
     half = 0.5 * load_vehicle("finsrov").body.size
-    reach = 0.75 - 0.045 - half[1]  # of the origin beside the axis, level and square to the gate
+    reach = 0.75 - 0.045 - half[1]  # positions of the origin beside the axis, level and square to the gate
     places = [
         [0.3, 0, 0],
         [0.02, 1.5, 0],
@@ -255,11 +258,12 @@ def test_a_gate_is_passed_between_its_posts_and_a_bar_is_touched_where_the_envel
         np.testing.assert_array_equal(np.where(step.terminated, measured[name], 0.0), ends, err_msg=name)
     np.testing.assert_array_equal(step.terminated, [True, True, True, False, False, True])
     turned, step = stepped(task, [[0, reach - 0.02, 0]], yaw=np.pi / 4)
-    assert turned["touched"][0] == 1.0  # its corners stand out farther
+    assert turned["touched"][0] == 1.0  # its corners protrude farther
 
 
 def test_the_distance_of_a_bar_from_a_box_is_the_least_of_its_points():
-    """Against ten thousand points of each of 50 bars about a box, to what a cylinder's radius leaves of it."""
+    """The distance equals the least over ten thousand points of each of 50 bars, to the resolution of their
+    radius."""
     random, half = np.random.default_rng(2), np.array([0.28, 0.19, 0.15])
     for a, b in random.uniform(-1.0, 1.0, (50, 2, 3)):
         points = a + np.linspace(0.0, 1.0, 10_000)[:, None] * (b - a)
@@ -270,14 +274,14 @@ def test_the_distance_of_a_bar_from_a_box_is_the_least_of_its_points():
 
 
 def corners(env):
-    """Ends and corners of each world's net, world frame, (worlds, 4, 3)."""
+    """Return ends and corners of each world's net, world frame, (worlds, 4, 3)."""
     net = Rotation.from_quat(np.repeat(env.arrays.goal_quaternion.numpy(), 4, axis=0))
     places = net.apply(env.arrays.reference.position.numpy().reshape(-1, 3)).reshape(-1, 4, 3)
     return places + env.arrays.goal_position.numpy()[:, None]
 
 
 def way_to_net(points, corners):
-    """From points seen from above to the nearest point of a net, (n, 2), whose sides run through corners, (4, 2)."""
+    """Return horizontal vectors from points to the nearest point of a net, (n, 2), with corners (4, 2)."""
     ways = []
     for a, b in zip(corners, corners[1:], strict=False):
         t = np.clip((points - a) @ (b - a) / np.sum((b - a) ** 2), 0.0, 1.0)
@@ -287,9 +291,9 @@ def way_to_net(points, corners):
 
 
 def test_along_a_net_the_row_has_the_range_below_and_the_picture_the_echoes_of_the_net():
-    """The range is the slant way to the tube at the net's foot, to 0.3 m; the point the baseline finds is the net's.
+    """The range is the slant distance to the tube at the net's foot, to 0.3 m; the baseline finds a point of the net.
 
-    Both are those of now, at the start of an episode and after steps, of a sensor without latency; the last row of an
+    Both are current values of a sensor without latency, at the start of an episode and after steps; the last row of an
     episode is kept with its range.
     """
     now = load_vehicle("finsrov").replace({"perception.altimeter.latency": 0.0})
@@ -313,7 +317,7 @@ def test_along_a_net_the_row_has_the_range_below_and_the_picture_the_echoes_of_t
 
 
 def test_the_sides_of_a_net_meet_as_those_of_its_site_do_with_a_world_and_without():
-    """Equal lengths, and corners at angles of up to 30° to either side; the ropes stand where the sides meet."""
+    """Sides have equal lengths and meet at up to 30° to either side; the ropes stand at the corners."""
     bends = {}
     for task in (Net(), Net().for_teacher()):
         env = Environment(task, worlds=200, seed=3)
@@ -329,7 +333,7 @@ def test_the_sides_of_a_net_meet_as_those_of_its_site_do_with_a_world_and_withou
 
 
 def test_the_teacher_of_the_net_sees_the_line_round_the_corner():
-    """Now and 0.5 m on, the way there leads to 1.5 m from the net, and where it faces is where the net is."""
+    """Now and 0.5 m ahead, the target lies 1.5 m from the net, and the heading points at the net."""
     env, random = Environment(Net().for_teacher(), worlds=200, seed=4), np.random.default_rng(1)
     goal, net_q = env.arrays.goal_position.numpy().copy(), env.arrays.goal_quaternion.numpy().copy()
     off = random.uniform([-1.8, -1.0, -2.8], [-1.2, 3.0, -2.2], (200, 3))
@@ -350,7 +354,8 @@ def test_the_teacher_of_the_net_sees_the_line_round_the_corner():
 
 
 def test_a_net_is_touched_with_the_nose_and_lost_beside_the_line():
-    """0.12 m before the net, where growth is; 0.8 m off the line; on it neither."""
+    """0.12 m before the net, within its growth, is a touch; 0.8 m off the line is a loss; on the line it is
+    neither."""
     task = Net().for_teacher()
     check_task(task)
     nose, level = 0.5 * load_vehicle("finsrov").body.size[0], task.level
@@ -370,9 +375,9 @@ def test_a_net_is_touched_with_the_nose_and_lost_beside_the_line():
 
 
 def test_a_net_is_touched_wherever_the_envelope_meets_it_round_its_corners_too():
-    """Level vehicles at any heading near both corners: by the distance of points of theirs from the sides.
+    """Level vehicles near both corners, at any heading, are compared by the distance of their points from the sides.
 
-    Where corner meets corner the task may say so 5 cm too early.
+    Where two corners meet, the task may report a touch 5 cm early.
     """
     worlds, random = 400, np.random.default_rng(7)
     env = Environment(
@@ -399,7 +404,7 @@ def test_a_net_is_touched_wherever_the_envelope_meets_it_round_its_corners_too()
 
 
 def test_who_follows_the_net_at_the_wrong_distance_has_not_inspected_it():
-    """The baseline that holds 1.5 m succeeds; the same one that holds 1.8 m covers the way, and does not."""
+    """The baseline at 1.5 m succeeds; the same baseline at 1.8 m covers the path and does not succeed."""
     for distance, success in ((1.5, 1.0), (1.8, 0.0)):
         env = Environment(Net(), worlds=4, seed=3, auto_reset=False)
         follower = replace(WallFollower.for_vehicle(env.nominal[0]), distance=distance)
@@ -414,8 +419,11 @@ def test_who_follows_the_net_at_the_wrong_distance_has_not_inspected_it():
 
 @pytest.mark.parametrize("name", [name for name in TASKS if TASKS[name]().pictures])
 def test_the_kernels_of_tasks_that_see_compile_for_cuda(name, tmp_path):
-    """NVRTC, which needs no device, makes PTX for compute capability 7.5: of the task, its teacher's, and of what all
-    of them are run and measured with; `test_cuda` has what they see with."""
+    """NVRTC, which needs no device, compiles the kernels to PTX for compute capability 7.5.
+
+    These are the kernels of the task, of its teacher, and of running and measuring tasks; `test_cuda` covers the
+    sensors.
+    """
     wp.init()
     if wp.get_cuda_toolkit_version() is None:
         pytest.skip("this Warp has no CUDA compiler")

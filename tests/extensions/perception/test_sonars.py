@@ -1,4 +1,4 @@
-"""Imaging sonars, altimeters and DVL beams against closed forms of the sonar equation and of geometry."""
+"""Imaging sonars, altimeters and DVL beams compared with closed forms of the sonar equation and of geometry."""
 
 import math
 
@@ -19,7 +19,7 @@ MU = 0.1
 
 
 def sonar(**changes):
-    """One without noise, whose gain undoes the absorption alone."""
+    """Return a sonar without noise, with a gain that compensates absorption only."""
     values = {"about": "-", "source": "-", "frequency": 720e3, "beams": 121, "sector": math.radians(60.0)}
     values |= {"beam_width": math.radians(1.0), "vertical_beam_width": WIDTH, "range": 10.0, "bins": 500}
     values |= {"elevations": 48, "noise_level_db": -200.0, "gain_spreading": 0.0, "rate": 10.0}
@@ -33,7 +33,7 @@ def echo(batch, device, pose, **options):
 
 
 def pattern(elevation):
-    """Two-way, of a beam that is half as strong, one way, at half its width."""
+    """Return the two-way pattern of a beam that has half its one-way strength at half its width."""
     return 0.5 ** (2.0 * (2.0 * elevation / WIDTH) ** 2)
 
 
@@ -76,7 +76,7 @@ def test_a_wall_echoes_with_the_square_of_range(distance, scenes, level):
 
 
 def test_no_gaps_open_on_a_slanting_floor(scenes, level):
-    """Sixteen rays of 20° over a floor 1.5 m below, cells of 1 cm: between first and last echo none is empty."""
+    """Between first and last echo no cell is empty: sixteen rays of 20°, a floor 1.5 m below, cells of 1 cm."""
     device = sonar(elevations=16, range=12.0, bins=1200, mount=DeviceMount(pitch=math.radians(15.0)))
     _, intensity = echo(scenes("floor"), device, level(0, 0, -8.5))
     filled = intensity[60] > 0.0
@@ -85,7 +85,8 @@ def test_no_gaps_open_on_a_slanting_floor(scenes, level):
 
 
 def test_speckle_is_rayleigh(scenes, level):
-    """Power of noise alone is exponential: its standard deviation is its mean; amplitude has 0.52 of its own."""
+    """The power of noise alone is exponential, with standard deviation equal to its mean; for amplitude it is
+    0.52."""
     device = sonar(noise_level_db=-60.0, mount=DeviceMount(pitch=-0.6))
     _, intensity = echo(scenes("floor"), device, level(0, 0, -5), seed=3)
     power = intensity[:, 10:200]
@@ -96,7 +97,8 @@ def test_speckle_is_rayleigh(scenes, level):
 
 
 def test_equal_seeds_give_equal_pings(dock, poses):
-    """Bit for bit; another time has other speckle; the mean power does not depend on a seed."""
+    """Equal seeds are bit-identical; another time has other speckle; the mean power does not depend on the
+    seed."""
     place = ((0.2, -0.7, -3.3), (0, 0, 0, 1))
     sensor = SonarBatch(dock, sonar(beams=32, bins=64, elevations=16, noise_level_db=-110.0))
     at = poses(place, place, place)
@@ -118,7 +120,7 @@ ATTITUDES = [(0.0, 0.0, 0.0), (0.1, 0.0, 1.0), (0.0, -0.2, 0.3), (-0.15, 0.1, -2
 
 @pytest.mark.parametrize(("roll", "pitch", "yaw"), ATTITUDES)
 def test_dvl_beams_measure_the_floor_along_their_directions(roll, pitch, yaw, scenes, poses):
-    """h / cos of the angle of each beam from the vertical, at any attitude, to single precision."""
+    """A beam measures h / cos of its angle from the vertical, at any attitude, to single precision."""
     device = ranger(beams=4, beam_angle=math.radians(22.5))
     sensor = RangeBatch(scenes("floor"), device)
     attitude = quat_from_euler(roll, pitch, yaw)
@@ -143,7 +145,7 @@ def test_an_altimeter_over_a_floor_at_a_tilt(tilt, scenes, poses):
 
 
 def test_out_of_reach_is_infinite(scenes, poses):
-    """Nothing above, and a floor beyond the device's range."""
+    """Range is infinite without an object above, and for a floor beyond the device's range."""
     batch, up = scenes("floor"), quat_from_euler(0.0, math.pi, 0.0)
     assert RangeBatch(batch, ranger()).update(poses(((0, 0, -4), up))).numpy()[0, 0] == np.inf
     near = RangeBatch(batch, ranger(range=5.0)).update(poses(((0, 0, -4), (0, 0, 0, 1))))
@@ -151,14 +153,15 @@ def test_out_of_reach_is_infinite(scenes, poses):
 
 
 def test_a_side_scan_hears_a_ball_abeam(scenes, poses):
-    """A ball of 0.25 m 4 m to the left: in the left beam alone, at its near side, as loud as it is within 1 dB."""
-    turned = (0.0, 0.0, -math.sqrt(0.5), math.sqrt(0.5))  # its left is world x
+    """A ball of 0.25 m, 4 m to the left, echoes in the left beam only, from its near side, within 1 dB of its
+    strength."""
+    turned = (0.0, 0.0, -math.sqrt(0.5), math.sqrt(0.5))  # the vehicle's left is world x
     device = sonar(mode="side_scan", beams=2, elevations=96, vertical_beam_width=math.radians(50.0))
     sensor, intensity = echo(scenes("ball"), device, poses(((-4.0, 0, -5), turned)))
     assert intensity[1].sum() < 1e-9 * intensity[0].sum()  # the noise
     first = np.flatnonzero(intensity[0] > 0.01 * intensity[0].max())[0]
     assert abs(first * sensor.bin_length - 3.75) <= sensor.bin_length
-    # Its beam is narrower than the ball: mu times its width times the integral over elevation.
+    # The beam is narrower than the ball: mu times its width times the integral over elevation.
     width = math.radians(1.0) / 0.8859
     angle = math.asin(0.25 / 4.0)
 
@@ -172,17 +175,17 @@ def test_a_side_scan_hears_a_ball_abeam(scenes, poses):
 
 
 def test_a_side_scan_looks_down_to_both_sides(scenes, level):
-    """30° below the horizon over a floor 5 m below: the first echo comes from 5 m / sin 67.5°."""
+    """At 30° below the horizon over a floor 5 m below, the first echo comes from 5 m / sin 67.5°."""
     device = load_device("side_scan").model_copy(update={"noise_level_db": -200.0})
     sensor, intensity = echo(scenes("floor"), device, level(0, 0, -5))
     np.testing.assert_allclose(intensity[0], intensity[1], rtol=1e-3, atol=1e-12)
     first = np.flatnonzero(intensity[0] > 1e-3 * intensity[0].max())[0] * sensor.bin_length
-    assert 5.0 < first < 5.6  # where its rays end
+    assert 5.0 < first < 5.6  # angle of the lowest ray
 
 
 @pytest.mark.parametrize("roll", [0.0, 0.3])
 def test_a_profiler_draws_the_floor(roll, scenes, poses):
-    """Ranges h / cos(angle) of a flat floor, to a cell and most of a beam's footprint."""
+    """Ranges of a flat floor are h / cos(angle), to a cell and most of a beam's footprint."""
     device = load_device("profiler")
     sensor = SonarBatch(scenes("floor"), device)
     sensor.update(poses(((0, 0, -4), quat_from_euler(roll, 0.0, 0.0))))
@@ -207,7 +210,8 @@ def dvl(**changes):
 
 
 def test_a_dvl_has_the_velocity_of_its_point_from_its_beams(scenes, poses):
-    """Along each beam d . v, together v + omega x r in its own axes; noise spreads it as the beams' fit does."""
+    """Beams measure d . v and together v + omega x r in sensor axes; noise spreads it as the fit of the beams
+    predicts."""
     attitude = quat_from_euler(0.05, -0.1, 0.4)
     nu = np.array([0.6, -0.2, 0.1, 0.05, 0.1, -0.2], np.float32)
     twists = wp.array(nu[None, None], dtype=vec6)
@@ -228,7 +232,7 @@ def test_a_dvl_has_the_velocity_of_its_point_from_its_beams(scenes, poses):
 
 
 def test_a_dvl_locks_on_the_bottom_while_three_beams_reach_it(scenes, level):
-    """9 m over the floor no beam does; the lock is what another DVL may read, and a mask leaves it."""
+    """9 m over the floor no beam reaches it; another DVL may read the lock, and a mask leaves it unchanged."""
     twists = wp.array(np.float32([[[0.5, 0, 0, 0, 0, 0]]]), dtype=vec6)
     lock = wp.full((1, 1), 1, dtype=int)
     sensor = DopplerBatch(scenes("floor"), dvl(), twists, lock=lock)

@@ -1,4 +1,4 @@
-"""Sizes and light that differ by world, against what a ray and a level surface see of them."""
+"""Sizes and light that differ by world, measured by a ray and a level surface."""
 
 import numpy as np
 import pytest
@@ -30,7 +30,8 @@ BALL = """objects:
 
 @pytest.mark.slow
 def test_a_ray_meets_each_ball_where_it_was_drawn(site):
-    """Straight down onto the middle: 4 m less the radius, which varies by a factor of up to two and uses most of it."""
+    """A ray straight down measures 4 m less the radius, which varies by up to a factor of two and uses most
+    of it."""
     batch = WorldBatch(site(BALL), worlds=64)
     batch.draw(3)
     scale = batch.scales.numpy()[:, 0]
@@ -45,7 +46,7 @@ def test_a_ray_meets_each_ball_where_it_was_drawn(site):
 
 
 def test_a_vehicle_rests_on_a_ball_of_its_world(site):
-    """The contact force begins at the radius that was drawn, in each world."""
+    """The contact force begins at the drawn radius in each world."""
     layout = WorldLayout(site(BALL), worlds=8)
     simulator = Simulator("finsrov", worlds=8, world=layout, threads=1)
     layout.draw(5)

@@ -1,5 +1,5 @@
 # ruff: noqa: E402 - rclpy can be imported once a backend is active
-"""The other process of the tests: `peer.py WHAT`, talking on the domain of the environment until it is ended."""
+"""The second process of the tests: `peer.py WHAT` communicates on the environment's domain until it is ended."""
 
 import sys
 
@@ -21,7 +21,7 @@ LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class Echo(Node):
-    """Sends back what it gets, serves a service, and latched a goal at its start."""
+    """Node that returns its messages, serves a service, and latches a goal at its start."""
 
     def __init__(self) -> None:
         super().__init__("echo", namespace="peer")
@@ -39,13 +39,13 @@ class Echo(Node):
         self.create_service(SetBool, "set_armed", self.on_arm)
 
     def on_arm(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        """Answer with what was asked."""
+        """Answer with the requested value."""
         response.success, response.message = request.data, f"armed {request.data}"
         return response
 
 
 class Settings(Node):
-    """Publishes its parameters as a command, on a topic that the command line renames."""
+    """Node that publishes its parameters as a command, on a topic that the command line renames."""
 
     def __init__(self) -> None:
         super().__init__("settings", namespace="peer")

@@ -1,5 +1,5 @@
 # ruff: noqa: E402 - rclpy can be imported once a backend is active
-"""The hardware bridge in front of an autopilot: armed by its service, once the autopilot is; and a whole graph."""
+"""The hardware bridge with an autopilot: arming by service waits for the autopilot; a whole graph drives it."""
 
 import socket
 import subprocess
@@ -26,7 +26,7 @@ from reference.ros_time import RosTime
 
 
 class Wire:
-    """To an emulated ArduSub in this process, whose time is that of /clock."""
+    """Link to an emulated ArduSub in this process, on the time of /clock."""
 
     def __init__(self):
         body = vehicle_at("tank", load_vehicle("bluerov2_heavy"), navigation=True)
@@ -49,7 +49,7 @@ class Wire:
 
 @pytest.mark.slow
 def test_the_service_arms_once_the_autopilot_has_armed():
-    """Until then it answers what is waited for; nobody who does not ask arms; disarming disarms the autopilot."""
+    """Until then the service reports what it waits for; only a request arms; disarming disarms the autopilot."""
     words = "vehicle:='bluerov2_heavy' site:='tank' robot:='mavlink://udpin:127.0.0.1:0' need_reading:=false"
     words += " use_sim_time:=true"
     rclpy.init(args=["--ros-args", *(word for option in words.split() for word in ("-p", option))])
@@ -86,7 +86,7 @@ def test_the_service_arms_once_the_autopilot_has_armed():
 
 
 def three_ports():
-    """A UDP port whose next two TCP ports are free."""
+    """Return a UDP port whose next two TCP ports are free."""
     while True:
         with ExitStack() as stack:
             try:
@@ -103,7 +103,7 @@ def three_ports():
 
 @pytest.mark.slow
 def test_a_whole_graph_drives_an_autopilot_to_its_goal(alone, tmp_path):
-    """In lock-step from one command: armed by the autopilot, and within 10 cm of the goal by the truth."""
+    """In lock-step, one command arms the autopilot and drives the true vehicle to within 10 cm of the goal."""
     goal, truth = (0.6, 0.0, -2.0), tmp_path / "run.truth"
     words = "ros2 up pool --firmware ardusub --vehicle bluerov2_heavy --site tank --severity nominal --let-in 0,0 "
     words += f"--start 0,0,-2,0 --goal 0.6,0,-2,0 --arm --lockstep --duration 25 --port {three_ports()} --truth {truth}"
@@ -111,5 +111,5 @@ def test_a_whole_graph_drives_an_autopilot_to_its_goal(alone, tmp_path):
     done = subprocess.run(command, capture_output=True, text=True, timeout=300.0)
     assert done.returncode == 0, done.stdout + done.stderr
     true = read_truth(truth)
-    before = true.position[true.time < true.time[-1] - 1.0]  # at the end it is disarmed
+    before = true.position[true.time < true.time[-1] - 1.0]  # the vehicle is disarmed at the end
     assert np.linalg.norm(before[-1] - goal) < 0.1 and abs(before[0] - goal).max() > 0.5

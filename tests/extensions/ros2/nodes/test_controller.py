@@ -1,5 +1,5 @@
 # ruff: noqa: E402 - rclpy can be imported once a backend is active
-"""The controller node beside a bridge and an estimator that we play on the wire, and the person who drives."""
+"""The controller node with a simulated bridge and estimator on the wire, and with a human operator."""
 
 import json
 import math
@@ -34,7 +34,7 @@ PLACE = np.array([0.2, 0.1, -0.5])
 
 
 class Stage:
-    """A node under test, and a peer that plays everything around it."""
+    """Node under test, and a peer that simulates everything around it."""
 
     def __init__(self, make):
         self.peer = Node("peer", namespace="finsrov")
@@ -54,7 +54,7 @@ class Stage:
             False,
         )
         self.clock = None
-        """Simulated time that the peer publishes [ns]; the system's if None."""
+        """Simulated time that the peer publishes [ns]; None for the system's time."""
         self._clock = self.peer.create_publisher(ros_type("rosgraph_msgs/msg/Clock"), "/clock", 10)
         self._out = {
             key: self.peer.create_publisher(
@@ -67,7 +67,7 @@ class Stage:
         self._out[key].publish(message or ros_type(TOPICS[key].type)(**fields))
 
     def play(self):
-        """One turn of everything around the node: a state, and what the bridge says."""
+        """Publish one turn of the node's inputs: a state and the bridge's messages."""
         if self.clock is not None:
             self.clock += 10_000_000
             self._clock.publish(self.make.clock(self.clock))
@@ -83,7 +83,7 @@ class Stage:
                 rclpy.spin_once(node, timeout_sec=0.001)
 
     def until(self, condition, each=lambda: None):
-        """Play until a condition holds; whether it does in time."""
+        """Play until a condition is true; return whether it became true in time."""
         end = time.monotonic() + PATIENCE
         while not condition() and time.monotonic() < end:
             each()
@@ -98,7 +98,7 @@ class Stage:
         return [e["text"] for m in self.heard["event"] if (e := json.loads(m.data))["kind"] == kind]
 
     def asked(self):
-        """Thrusts of the newest command."""
+        """Return the thrusts of the newest command."""
         return force_of(self.heard["command"][-1], self.make.names)
 
     def close(self):
@@ -107,7 +107,7 @@ class Stage:
 
 @pytest.fixture
 def wire():
-    """The process's presence, with the node's parameters as arguments."""
+    """Participant of this process, with the node's parameters as arguments."""
     stages = []
 
     def start(make, *arguments):
@@ -122,7 +122,7 @@ def wire():
 
 
 def pid_force(goal):
-    """What the same PID asks for at the stage's place, on its first decision."""
+    """Return the force of the same PID at the stage's position on its first decision."""
     vehicle = load_vehicle("finsrov")
     pid = controller("pid", vehicle)
     at = Reading(0.0, PLACE, np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(6), True)
@@ -132,9 +132,9 @@ def pid_force(goal):
 
 
 def test_it_is_silent_until_the_bridge_is_armed(wire):
-    """Then it asks for what the PID asks for, towards the goal of its parameter; disarmed, it is silent again."""
+    """Armed, it requests the PID's forces towards the goal of its parameter; disarmed, it is silent again."""
     stage = wire(ControllerNode, "-p", "goal:='0.6,0.1,-0.5,0'", "-p", "use_sim_time:=true")
-    stage.clock = 10 * 10**9  # one decision a turn at most, so that none is overwritten unheard
+    stage.clock = 10 * 10**9  # at most one decision a turn, so that no message is overwritten unread
     assert stage.until(lambda: stage.node.state.reading(stage.node.now()).ready)
     stage.turns(20)
     assert not stage.heard["command"]
@@ -151,7 +151,7 @@ def test_it_is_silent_until_the_bridge_is_armed(wire):
 
 
 def test_without_a_goal_it_keeps_the_place_where_it_was_armed(wire):
-    """And a goal by topic moves it, one outside the workspace or not level does not."""
+    """A goal by topic moves the hold position; one outside the workspace or not level does not."""
     stage = wire(ControllerNode)
     stage.state = "armed"
     assert stage.until(lambda: stage.heard["command"])
@@ -170,7 +170,8 @@ def test_without_a_goal_it_keeps_the_place_where_it_was_armed(wire):
 
 @pytest.mark.parametrize("durability", ["VOLATILE", "TRANSIENT_LOCAL"])
 def test_a_goal_that_is_given_again_is_followed_again(wire, capfd, durability):
-    """From publishers of either durability, as RViz and `ros2 topic pub` are, and no policy is said not to fit."""
+    """Publishers of either durability, such as RViz and `ros2 topic pub`, cause no warning of incompatible
+    policies."""
     stage = wire(ControllerNode)
     policies = QoSProfile(depth=1, durability=DurabilityPolicy[durability])
     publisher = stage.peer.create_publisher(ros_type(TOPICS["goal"].type), "goal", policies)
@@ -183,7 +184,7 @@ def test_a_goal_that_is_given_again_is_followed_again(wire, capfd, durability):
 
 
 def test_commands_say_who_asks_and_in_which_mode(wire):
-    """The node is one commander whatever its mode."""
+    """The node is one commander in every mode."""
     stage = wire(ControllerNode)
     stage.state = "armed"
     assert stage.until(lambda: stage.heard["command"])
@@ -193,7 +194,7 @@ def test_commands_say_who_asks_and_in_which_mode(wire):
 
 
 def test_a_path_with_times_is_followed_and_shown_with_times(wire):
-    """Times count from the first pose; what is shown is stamped with when each pose is due."""
+    """Times count from the first pose; each pose of the displayed path is stamped with its due time."""
     stage = wire(ControllerNode)
     stage.state = "armed"
     assert stage.until(lambda: stage.heard["path"] and stage.heard["command"])
@@ -213,7 +214,7 @@ def test_a_path_with_times_is_followed_and_shown_with_times(wire):
 
 
 def test_a_way_is_shown_again_when_it_begins(wire):
-    """Arming is when its time begins."""
+    """The time of a path begins at arming."""
     stage = wire(ControllerNode, "-p", "trajectory:=lemniscate")
     assert stage.until(lambda: stage.heard["path"])
     stage.turns(5)
@@ -226,7 +227,7 @@ def test_a_way_is_shown_again_when_it_begins(wire):
 
 
 def leap(path):
-    """A metre in a millisecond."""
+    """Change the path to a metre in a millisecond."""
     path.poses[1].pose.position.x = path.poses[0].pose.position.x + 1.0
     path.poses[1].header.stamp.sec, path.poses[1].header.stamp.nanosec = 0, 10**6
 
@@ -249,7 +250,7 @@ def leap(path):
     ],
 )
 def test_a_path_that_cannot_be_followed_is_refused(wire, change, words):
-    """In a sentence on `events`, and the way before it is kept."""
+    """The refusal is a sentence on `events`, and the previous path is kept."""
     stage = wire(ControllerNode, "-p", "goal:='0.6,0.1,-0.5,0'")
     path = stage.make.path(0, (0, 10**9), [(0.2, 0.1, -0.5), (0.3, 0.1, -0.5)], (0.0, 0.0))
     change(path)
@@ -259,14 +260,14 @@ def test_a_path_that_cannot_be_followed_is_refused(wire, change, words):
 
 
 def test_parameters_of_a_running_node_stay_as_they_are(wire):
-    """`ros2 param set` says so, in place of a success without effect."""
+    """`ros2 param set` is refused rather than succeeding without effect."""
     stage = wire(ControllerNode, "-p", "policy:=pid-paper")
     (result,) = stage.node.set_parameters([Parameter("policy", value="pid")])
     assert not result.successful and "read-only: set it at the start" in result.reason
 
 
 def test_a_node_keeps_its_clock(wire):
-    """use_sim_time on an armed robot would put its time elsewhere: refused with the reason, and nothing happens."""
+    """use_sim_time would change the time of an armed robot: it is refused with the reason and has no effect."""
     stage = wire(ControllerNode, "-p", "goal:='0.6,0.1,-0.5,0'")
     stage.state = "armed"
     assert stage.until(lambda: stage.heard["command"])
@@ -280,7 +281,7 @@ def test_a_node_keeps_its_clock(wire):
 
 
 def test_a_silent_estimator_ends_commands(wire):
-    """Half a second after its last word."""
+    """Commands end half a second after the last estimate."""
     stage = wire(ControllerNode, "-p", "goal:='0.6,0.1,-0.5,0'")
     stage.state = "armed"
     assert stage.until(lambda: stage.heard["command"])
@@ -293,7 +294,7 @@ def test_a_silent_estimator_ends_commands(wire):
 
 
 def test_a_silent_bridge_ends_commands_but_begins_nothing_anew(wire):
-    """A trajectory goes on where its time is when the bridge speaks again; only disarming starts it over."""
+    """A trajectory continues at its current time when the bridge returns; only disarming restarts it."""
     stage = wire(ControllerNode, "-p", "goal:='0.6,0.1,-0.5,0'")
     stage.state = "armed"
     assert stage.until(lambda: stage.heard["command"])
@@ -315,7 +316,7 @@ def test_a_silent_bridge_ends_commands_but_begins_nothing_anew(wire):
 
 
 def test_a_person_takes_over_by_mode_and_wrench(wire):
-    """The wrench becomes thrusts; one that is not finite, or has grown stale, is none; unknown modes are refused."""
+    """A wrench becomes thrusts unless it is not finite or stale; unknown modes are refused."""
     stage = wire(ControllerNode)
     stage.state = "armed"
     stage.send("mode", data="autopilot")
@@ -331,7 +332,7 @@ def test_a_person_takes_over_by_mode_and_wrench(wire):
 
 
 def joy(**held):
-    """A pad at rest, but for what is held."""
+    """Return the state of a pad at rest, except for the given controls."""
     axes, buttons = [0.0] * 8, [0] * 11
     axes[2] = axes[5] = 1.0
     for name, value in held.items():
@@ -342,7 +343,7 @@ def joy(**held):
 
 @pytest.mark.parametrize("kind", ["fault", "refused", "error"])
 def test_a_grave_event_may_follow_an_ordinary_one(wire, kind, capfd):
-    """And the other way round, as after an emergency stop: each is told and logged with its severity."""
+    """Either order, as after an emergency stop, is published and logged with its severity."""
     stage = wire(ControllerNode)
     for name in ("start", kind, "stop", kind):
         stage.node.event(name, "of the test")
@@ -352,7 +353,8 @@ def test_a_grave_event_may_follow_an_ordinary_one(wire, kind, capfd):
 
 
 def test_a_clock_of_somebody_else_does_not_end_an_armed_controller(wire):
-    """Simulated time that leaps from 10 s to the wall's is 1.7e10 missed decisions, more than the message's uint32."""
+    """A leap of simulated time from 10 s to the wall clock is 1.7e10 missed decisions, more than the
+    message's uint32."""
     stage = wire(ControllerNode, "-p", "use_sim_time:=true")
     stage.clock, stage.state = 10 * 10**9, "armed"
     assert stage.until(lambda: stage.heard["policy"])
@@ -375,13 +377,13 @@ def test_hands_on_a_pad_become_wrench_arm_and_stop(wire):
     stage.turns(20)
     assert newest() == 0.0
     assert stage.until(lambda: newest() == pytest.approx(6.0), lambda: pad.publish(drive))
-    assert stage.until(lambda: newest() == 0.0)  # nobody at the pad
+    assert stage.until(lambda: newest() == 0.0)  # no operator at the pad
     for _ in range(2):
         stage.until(lambda: stage.node.operator.command.lost is False, lambda: pad.publish(rest))
     assert not [m for m in stage.heard["arm"] if m.data]
 
     def press(button):
-        """Down and up, so that each is seen."""
+        """Press and release a button, so that both states are received."""
         pad.publish(rest if int(time.monotonic() * 5) % 2 else joy(**{f"b{button}": 1}))
 
     assert stage.until(lambda: [m for m in stage.heard["arm"] if m.data], lambda: press(7))

@@ -1,4 +1,4 @@
-"""Robot values to messages and back, through the bytes of the wire; malformed ones come out as words, never raise."""
+"""Robot values become messages and return through wire bytes; malformed ones give a reason and never raise."""
 
 import json
 import math
@@ -48,13 +48,13 @@ ANY = st.floats(allow_nan=True, allow_infinity=True)
 
 
 def wire(message):
-    """The message after a trip over the wire."""
+    """Return the message after serialisation and deserialisation."""
     codec = codec_of()
     return codec.deserialize(bytes(codec.serialize(message)), message.TYPE)
 
 
 def telemetry(**changes):
-    """A snapshot whose numbers all differ."""
+    """Return a snapshot with distinct numbers."""
     values = {
         "sequence": 65_535,
         "mcu_ms": 2**32 - 1,
@@ -71,7 +71,7 @@ def telemetry(**changes):
 
 @pytest.mark.parametrize("rpm", [tuple(float(i) for i in range(8)), None])
 def test_telemetry_comes_back_as_it_was(rpm):
-    """Every field, with both times."""
+    """Every field survives, with both times."""
     message = wire(MAKE.telemetry(STAMP, STAMP + 5, telemetry(motor_rpm=rpm)))
     assert telemetry_of(message) == telemetry(motor_rpm=rpm)
     assert (nanoseconds(message.header.stamp), nanoseconds(message.received)) == (STAMP, STAMP + 5)
@@ -87,7 +87,8 @@ def test_telemetry_comes_back_as_it_was(rpm):
     ],
 )
 def test_what_a_navigation_instrument_said_comes_back_as_it_was(kind, values, std):
-    """All but its sequence; one of another frame is refused, and a variance that is no number is passed on."""
+    """All but its sequence survives; another frame is refused, and a variance that is not a number is passed
+    on."""
     key, message = MAKE.aid(STAMP, NavigationAid(7, kind, 0.25, values, std))
     message = wire(message)
     frame = TOPICS[key].frame
@@ -102,7 +103,7 @@ def test_what_a_navigation_instrument_said_comes_back_as_it_was(kind, values, st
 
 
 def test_an_imu_message_is_in_body_axes():
-    """REP-103: what the unit measures is turned by its mount, x forward, y left, z up."""
+    """Measurements are turned by the unit's mount into the axes of REP-103: x forward, y left, z up."""
     mount = VEHICLE.sensors.imu.orientation
     message = wire(MAKE.imu(STAMP, telemetry()))
     from finssim.core.rotations import quat_rotate
@@ -114,7 +115,7 @@ def test_an_imu_message_is_in_body_axes():
 
 
 def test_thrusts_are_matched_by_name():
-    """In whatever order they are named."""
+    """Names may come in any order."""
     names, force = list(MAKE.names), np.arange(8.0)
     message = wire(MAKE.command(STAMP, force, "pid"))
     assert force_of(message, names).tolist() == force.tolist()
@@ -132,7 +133,7 @@ def test_thrusts_are_matched_by_name():
     ],
 )
 def test_a_command_that_cannot_be_used_says_why(names, force, words):
-    """Too short, other names, nothing, NaN."""
+    """Commands that are too short, empty, NaN or have other names are refused with the reason."""
     message = MAKE.command(STAMP, np.zeros(8), "pid")
     message.force = force
     if names is not None:
@@ -141,7 +142,7 @@ def test_a_command_that_cannot_be_used_says_why(names, force, words):
 
 
 def reading(**changes):
-    """A reading whose numbers all differ."""
+    """Return a reading with distinct numbers."""
     values = {
         "time": 12.5,
         "position": np.array([0.5, -0.25, -0.75]),
@@ -155,7 +156,7 @@ def reading(**changes):
 
 
 def test_a_reading_comes_back_as_it_was():
-    """From Odometry and EstimatorStatus together."""
+    """Odometry and EstimatorStatus together restore the reading."""
     odometry, status = wire(MAKE.odometry(STAMP, reading())), wire(MAKE.estimator(STAMP, reading(), {}))
     back = reading_of(status, odometry, 12.5)
     for name in ("position", "quaternion", "nu", "std"):
@@ -165,7 +166,7 @@ def test_a_reading_comes_back_as_it_was():
 
 
 def test_covariances_hold_numbers_only():
-    """As filters take them: turned into the axes of the twist, and large where nothing is known."""
+    """Covariances suit filters: turned into the axes of the twist, and large where values are unknown."""
     odometry = MAKE.odometry(STAMP, reading())
     pose, twist = (np.reshape(c.covariance, (6, 6)) for c in (odometry.pose, odometry.twist))
     assert np.diag(pose) == pytest.approx([1e-4, 4e-4, 9e-4, 0.02, 0.02, 25e-4])
@@ -181,7 +182,7 @@ def test_covariances_hold_numbers_only():
 
 @given(numbers=st.lists(ANY, min_size=13, max_size=13))
 def test_a_reading_with_a_bad_number_is_not_ready(numbers):
-    """Whatever the message says of itself."""
+    """The ready flag of the message does not matter."""
     odometry, status = MAKE.odometry(STAMP, reading()), MAKE.estimator(STAMP, reading(), {})
     pose, twist = odometry.pose.pose, odometry.twist.twist
     pose.position.x, pose.position.y, pose.position.z = numbers[:3]
@@ -196,14 +197,14 @@ def test_a_reading_with_a_bad_number_is_not_ready(numbers):
 
 
 def test_without_odometry_nothing_is_known():
-    """And so a controller may not act."""
+    """Without odometry a controller may not act."""
     back = reading_of(MAKE.estimator(STAMP, reading(), {}), None, 0.0)
     assert not back.ready and np.isnan(back.position).all() and back.reason == "no odometry"
 
 
 @given(x=ANY, yaw=st.floats(-3.1, 3.1), tilt=st.floats(-3.0, 3.0))
 def test_a_goal_is_a_level_pose_or_a_sentence(x, yaw, tilt):
-    """Finite, in the map, upright."""
+    """A goal must be finite, in the map and upright; otherwise the reason is returned."""
     message = wire(MAKE.goal(STAMP, (x, -0.25, -0.75), yaw))
     qx, qy, qz, qw = (float(v) for v in quat_from_euler(tilt, 0.0, yaw))
     q = message.pose.orientation
@@ -218,7 +219,7 @@ def test_a_goal_is_a_level_pose_or_a_sentence(x, yaw, tilt):
 
 
 def test_a_goal_of_another_frame_is_refused():
-    """Nobody knows where that would be."""
+    """The position of another frame is unknown."""
     message = MAKE.goal(STAMP, (0.0, 0.0, -0.5), 0.0)
     message.header.frame_id = "base_link"
     assert "frame 'base_link'" in station_of_pose(message)
@@ -256,7 +257,7 @@ def test_pictures_come_back_as_they_were():
     data=st.binary(max_size=90),
 )
 def test_a_malformed_picture_is_none(height, width, step, encoding, data):
-    """Sizes that do not fit each other, unknown encodings, bytes that are no JPEG."""
+    """Inconsistent sizes, unknown encodings and bytes that are not a JPEG give None."""
     message = ros_type("sensor_msgs/msg/Image")(
         height=height, width=width, step=step, encoding=encoding, data=data
     )
@@ -266,7 +267,7 @@ def test_a_malformed_picture_is_none(height, width, step, encoding, data):
 
 
 def test_tags_come_back_as_they_were():
-    """With the time of exposure and who found them."""
+    """Tags survive with their time of exposure and their detector."""
     corners = np.array([[1.5, 2.25], [3.0, 4.0], [5.0, 6.0], [7.0, 8.0]])
     picture = Picture(0.0, 7, None, (TagCorners(3, corners),))
     stamp, finder, back = tags_of(wire(MAKE.found_tags(STAMP, picture, "camera")))
@@ -286,7 +287,7 @@ JSON = st.recursive(
 @pytest.mark.slow
 @given(told=JSON)
 def test_malformed_tags_are_none(told):
-    """Any JSON, and what is none."""
+    """Other JSON and text that is not JSON give None."""
     text = ros_type("std_msgs/msg/String")
     for data in (json.dumps(told), json.dumps(told)[:-1]):
         found = tags_of(text(data=data))
@@ -295,19 +296,20 @@ def test_malformed_tags_are_none(told):
 
 @pytest.mark.parametrize("stamp", ["1" + 400 * "0", "-1" + 400 * "0", str(2**31 * 10**9), "1e400", "NaN"])
 def test_tags_of_a_time_that_no_stamp_has_are_none(stamp):
-    """JSON has numbers of any size: one of 400 digits is no float, which would end the localizer."""
+    """JSON numbers have any size: one of 400 digits is not a float and would end the localizer."""
     told = f'{{"stamp_ns": {stamp}, "sequence": 1, "finder": "camera", "tags": []}}'
     assert tags_of(ros_type("std_msgs/msg/String")(data=told)) is None
 
 
 def test_every_topic_of_the_table_has_its_type():
-    """Each can be imported as rclpy's classes are."""
+    """Each type can be imported like the classes of rclpy."""
     for topic in TOPICS.values():
         assert ros_type(topic.type)
 
 
 def test_values_of_other_actuators_are_matched_by_name():
-    """Joints in whatever order; another name, and a number that is none, are refused in words."""
+    """Joints may come in any order; an unknown name and a value that is not a number are refused with the
+    reason."""
     make = RosMessages(torpedo())
     message = wire(make.actuators(STAMP, [0.1, -0.2, 3e-4, 0.01]))
     assert setpoints_of(message, make.others).tolist() == [0.1, -0.2, 3e-4, 0.01]

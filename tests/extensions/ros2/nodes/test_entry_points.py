@@ -1,5 +1,5 @@
 # ruff: noqa: E402 - rclpy can be imported once a backend is active
-"""The functions that `ros2 run finssim_ros NODE` calls: what stands on the command line reaches the node."""
+"""Functions that `ros2 run finssim_ros NODE` calls: the arguments of the command line reach the node."""
 
 import os
 import runpy
@@ -25,7 +25,7 @@ PACKAGE = Path(__file__).resolve().parents[4] / "ros2_ws" / "src" / "finssim_ros
 
 @pytest.fixture
 def entry(monkeypatch):
-    """Call an installed function with a command line, in this process; what comes back."""
+    """Function that calls an installed function with a command line, in this process, and returns its result."""
     import setuptools
 
     told = {}
@@ -50,7 +50,7 @@ def entry(monkeypatch):
 
 @pytest.fixture
 def lived(monkeypatch):
-    """What nodes were when they would have begun to run: they end at once instead."""
+    """Nodes that would have started to run: they end at once instead."""
     seen = []
     for kind in (RobotNode, VirtualPoolNode):
         monkeypatch.setattr(kind, "spin", lambda self: seen.append(self))
@@ -59,13 +59,14 @@ def lived(monkeypatch):
 
 @pytest.mark.parametrize("node", NODES)
 def test_every_installed_node_takes_its_ros_arguments(entry, lived, capsys, node):
-    """A vehicle that does not exist is refused by name; the node would run an ordinary one if it had not heard."""
+    """A vehicle that does not exist is refused by name; without the argument the node would run an ordinary
+    one."""
     assert entry(node, "--ros-args", "-p", "vehicle:=nosuch") == 2 and not lived
     assert "'nosuch'" in capsys.readouterr().err
 
 
 def test_names_parameters_and_files_reach_an_installed_node(entry, lived, tmp_path):
-    """As `ros2 launch` passes them on: node, namespace, use_sim_time and a parameter file."""
+    """`ros2 launch` passes on a node name, a namespace, use_sim_time and a parameter file."""
     file = tmp_path / "own.yaml"
     file.write_text("/**:\n  ros__parameters: {vehicle: bluerov2_heavy, policy: pid-paper}\n")
     words = f"-r __node:=pilot -r __ns:=/deep/blue -p use_sim_time:=true --params-file {file}"
@@ -80,27 +81,27 @@ def test_names_parameters_and_files_reach_an_installed_node(entry, lived, tmp_pa
     ("node", "setting"), [("recorder", "pool_file:=gone.yaml"), ("localizer", "pool_file:=gone.yaml")]
 )
 def test_an_installed_node_refuses_a_missing_file_in_a_sentence(entry, lived, capsys, node, setting):
-    """Not with a traceback."""
+    """The message is not a traceback."""
     words = ("--ros-args", "-p", setting, "-p", "record:=x.mcap")
     assert entry(node, *words) == 2 and not lived
     assert "gone.yaml" in capsys.readouterr().err and not Path("x.mcap").exists()
 
 
 def test_a_recorder_without_a_pool_records(entry, lived, tmp_path):
-    """pool_file:=none is no file to be copied; a localizer without one has nothing to do, and says so."""
+    """With pool_file:=none the recorder copies no file; a localizer without one has no work and reports that."""
     record = tmp_path / "x.mcap"
     assert entry("recorder", "--ros-args", "-p", "pool_file:=none", "-p", f"record:={record}") == 0
     assert lived and record.exists()
 
 
 def test_a_localizer_without_a_pool_is_refused(entry, lived, capsys):
-    """In a sentence that says what to do."""
+    """The message states what to do."""
     assert entry("localizer", "--ros-args", "-p", "pool_file:=none") == 2 and not lived
     assert "start none where no camera looks" in capsys.readouterr().err
 
 
 def test_an_older_workspace_that_gives_no_arguments_keeps_those_of_the_process(monkeypatch, lived, capsys):
-    """Its functions call `run_node` with the name alone."""
+    """Functions of an older workspace call `run_node` with the name only."""
     monkeypatch.setattr(RobotNode, "listening", 0.0)
     monkeypatch.setattr(RobotNode, "urgent", False)
     monkeypatch.setattr(sys, "argv", ["sim", "--ros-args", "-p", "vehicle:=nosuch"])
@@ -108,7 +109,7 @@ def test_an_older_workspace_that_gives_no_arguments_keeps_those_of_the_process(m
 
 
 def test_a_node_whose_context_is_shut_down_during_a_call_ends_in_order(monkeypatch, capsys):
-    """As real rclpy does at SIGTERM, whatever the node is doing; a fault of its own keeps its traceback."""
+    """Real rclpy shuts down at SIGTERM during any call; an error of the node itself keeps its traceback."""
     monkeypatch.setattr(RobotNode, "urgent", False)
     monkeypatch.setattr("finssim.extensions.ros2.nodes.robot_node.LISTENING", 0.0)
     monkeypatch.setattr(RobotNode, "listening", 0.0)
@@ -140,7 +141,7 @@ def test_a_node_whose_context_is_shut_down_during_a_call_ends_in_order(monkeypat
 
 @pytest.mark.slow
 def test_the_script_that_colcon_installs_exits_with_the_status(tmp_path):
-    """The text that setuptools writes, as a process."""
+    """The script text of setuptools is run as a process."""
     script = tmp_path / "sim"
     script.write_text("import sys\nfrom finssim_ros.run import sim\nsys.exit(sim())\n")
     environ = {**os.environ, "PYTHONPATH": os.pathsep.join([str(PACKAGE), *sys.path])}

@@ -1,4 +1,4 @@
-"""Fixes travel in the map and come back into the pool's frame, covariances and all."""
+"""Fixes are sent in the map frame and return in the pool's frame, with their covariances."""
 
 from dataclasses import replace
 
@@ -20,7 +20,8 @@ SPREAD = np.array([[4e-4, 1e-4, 2e-5], [1e-4, 9e-4, -3e-5], [2e-5, -3e-5, 1e-3]]
 
 @pytest.mark.parametrize("turn", [(0.0, 0.0, 0.0), (0.0, 0.0, 2.2), (0.02, -0.03, 0.7)])
 def test_a_fix_comes_back_as_it_was(turn):
-    """Position, heading and covariance, for a map that lies turned, moved and leaning in the survey's frame."""
+    """Position, heading and covariance survive for a map that is turned, moved and tilted in the survey's
+    frame."""
     q = tuple(float(v) for v in quat_from_euler(*turn))
     pool = replace(true_site(), world_position=(0.3, -0.2, 1.0), world_orientation=q)
     estimator = Estimator(settings_of(VEHICLE), site_of(pool, VEHICLE))
@@ -39,7 +40,7 @@ def test_a_fix_comes_back_as_it_was(turn):
 
 
 def test_the_map_is_the_world_of_the_pool_file():
-    """A quarter turn: what lies along the pool's y lies along the map's x, and headings turn with it."""
+    """After a quarter turn the pool's y axis is the map's x axis, and headings turn with it."""
     q = tuple(float(v) for v in quat_from_euler(0.0, 0.0, np.pi / 2))
     pool = replace(true_site(), world_position=(0.0, 0.0, 1.0), world_orientation=q)
     estimator = Estimator(settings_of(VEHICLE), site_of(pool, VEHICLE))

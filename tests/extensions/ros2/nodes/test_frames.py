@@ -1,4 +1,4 @@
-"""Frames as REP-105 has them: odom never jumps, and map, odom and base_link make up the estimate."""
+"""Frames of REP-105: odom never jumps, and map, odom and base_link compose the estimate."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ DT = 1.0 / 60.0
 
 
 def circle(t, *, yaw=0.0, shift=(0.0, 0.0, 0.0)):
-    """A reading on a circle of 1 m at 0.5 m/s and 0.5 rad/s, tilted, with the map turned and shifted."""
+    """Return a reading on a circle of 1 m at 0.5 m/s and 0.5 rad/s, tilted, with the map turned and shifted."""
     heading = 0.5 * t + yaw
     place = (
         quat_rotate(quat_from_euler(0.0, 0.0, yaw), [np.sin(0.5 * t), 1.0 - np.cos(0.5 * t), -0.5]) + shift
@@ -25,7 +25,7 @@ def circle(t, *, yaw=0.0, shift=(0.0, 0.0, 0.0)):
 
 
 def test_odom_follows_the_way_by_velocities_alone():
-    """A whole turn of the circle ends where it began, to a millimetre."""
+    """After a whole turn of the circle odom returns to its start, to a millimetre."""
     odometer = Odometer()
     poses = [odometer.take(circle(i * DT)) for i in range(round(4.0 * np.pi / DT) + 1)]
     assert poses[0].position == pytest.approx(circle(0.0).position)
@@ -35,7 +35,7 @@ def test_odom_follows_the_way_by_velocities_alone():
 
 
 def test_odom_does_not_jump_when_a_fix_does():
-    """The step goes into map to odom, which with odom to base_link gives the estimate at every moment."""
+    """The jump enters map to odom, which with odom to base_link gives the estimate at every moment."""
     odometer, before = Odometer(), None
     for i in range(120):
         moved = {"yaw": 0.4, "shift": (0.3, -0.2, 0.1)} if i >= 60 else {}
@@ -55,7 +55,7 @@ def test_odom_does_not_jump_when_a_fix_does():
 
 
 def test_odom_stands_still_over_a_gap_and_over_bad_numbers():
-    """Nobody knows what was between."""
+    """Motion during a gap is unknown."""
     odometer = Odometer()
     first = odometer.take(circle(0.0)).position
     assert odometer.take(circle(3.0)).position == pytest.approx(first)
@@ -65,7 +65,7 @@ def test_odom_stands_still_over_a_gap_and_over_bad_numbers():
 
 
 def test_the_optical_frame_looks_along_x_of_its_body():
-    """z forward, x right, y down (REP-103)."""
+    """The optical frame has z forward, x right, y down (REP-103)."""
     assert np.column_stack([quat_rotate(OPTICAL, e) for e in np.eye(3)]) == pytest.approx(
         np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])
     )

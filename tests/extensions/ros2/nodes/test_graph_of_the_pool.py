@@ -1,4 +1,4 @@
-"""`finssim ros2 up pool` as a person starts it, in lock-step: processes on the loopback, and one that is killed."""
+"""`finssim ros2 up pool` as a user starts it, in lock-step: processes on the loopback, and a killed process."""
 
 import os
 import re
@@ -25,7 +25,7 @@ DISARMED, ARMED, HOLD, FAULT = range(4)
 
 
 def free_ports():
-    """A port with a free one after it, twice: for the pool and for the robot."""
+    """Return two ports, each followed by a free one: for the pool and for the robot."""
     found = []
     while len(found) < 2:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
@@ -41,7 +41,7 @@ def free_ports():
 
 
 class Graph:
-    """The launcher, what it says, and the node of the example that drives the vehicle."""
+    """Launcher, its output, and the example's node that drives the vehicle."""
 
     def __init__(self, folder):
         import rclpy
@@ -74,20 +74,20 @@ class Graph:
             )
 
     def until(self, holds, each=lambda: None):
-        """Step until a condition of the graph holds."""
+        """Step until a condition of the graph is true."""
         self.driver.until("", lambda vehicle: holds(), 20.0, lambda vehicle: each())
 
     def health(self):
-        """Latest level and words of each part."""
+        """Return the latest level and text of each part."""
         statuses = [status for m in self.heard["diagnostics"] for status in m.status]
         return {s.name: (int.from_bytes(s.level, "little"), s.message) for s in statuses}
 
     def pid(self, name):
-        """Process of a node, as the launcher tells it."""
+        """Return the process of a node as reported by the launcher."""
         return next(int(m[1]) for line in self.said if (m := re.match(rf"{name}: process (\d+)", line)))
 
     def end(self):
-        """Ctrl-C; the exit status."""
+        """Send Ctrl-C and return the exit status."""
         self.process.send_signal(signal.SIGINT)
         status = self.process.wait(60.0)
         self._rclpy.try_shutdown()
@@ -96,7 +96,7 @@ class Graph:
 
 @pytest.fixture(scope="module")
 def graph(alone, tmp_path_factory):
-    """Running."""
+    """Running graph."""
     graph = Graph(tmp_path_factory.mktemp("graph"))
     yield graph
     if graph.process.poll() is None:
@@ -105,9 +105,9 @@ def graph(alone, tmp_path_factory):
 
 @pytest.mark.slow
 def test_a_vehicle_is_driven_through_topics_alone(graph):
-    """Armed, at a goal, along a path and by teleoperation; every node is on the graph and tells its health.
+    """It is armed, driven to a goal, along a path and by teleoperation; every node is listed and reports its health.
 
-    The estimate in which the goals were reached is within 5 cm of the truth.
+    The estimate at the reached goals is within 5 cm of the truth.
     """
     try:
         graph.example["drive"](graph.driver)
@@ -131,8 +131,10 @@ def test_a_vehicle_is_driven_through_topics_alone(graph):
 
 @pytest.mark.slow
 def test_a_killed_controller_leaves_no_thrust(graph):
-    """kill -9: the bridge's states say zero from half a second after the last command, the launcher tells of it, and
-    time does not wait for the dead."""
+    """After kill -9 the bridge reports zero from half a second after the last command.
+
+    The launcher reports the death, and time continues without the dead process.
+    """
     vehicle, Bool = graph.driver.vehicles[0], ros_type("std_msgs/msg/Bool")
     graph.heard["command"].clear()
     graph.until(
@@ -144,7 +146,7 @@ def test_a_killed_controller_leaves_no_thrust(graph):
     begun = time.monotonic()
     graph.until(lambda: age(graph.heard["thrusters"][-1]) > 1.5)
     assert time.monotonic() - begun < 60.0
-    # Half a second of the bridge's own clock, and the steps that a command is under way.
+    # Half a second of the bridge's own clock, plus the steps during which a command is in transit.
     later = [m for m in graph.heard["thrusters"] if age(m) > 0.55]
     assert later and not np.any([m.force for m in later]) and not np.any([m.normalised for m in later])
     assert all(m.state in (HOLD, FAULT) for m in later)
@@ -155,9 +157,9 @@ def test_a_killed_controller_leaves_no_thrust(graph):
 
 @pytest.mark.slow
 def test_the_record_opens_and_no_process_is_left(graph):
-    """rosbags reads every topic with its type; the launcher's status says that a node died.
+    """rosbags reads every topic with its type; the launcher's status reports that a node died.
 
-    However busy the machine was, no estimate rested on inertial data older than two steps of /clock.
+    Even on a busy machine, no estimate used inertial data older than two steps of /clock.
     """
     pids = [graph.pid(name) for name in ("virtual_pool", "hardware_bridge", "recorder")]
     assert graph.end() == 1, "".join(graph.said)

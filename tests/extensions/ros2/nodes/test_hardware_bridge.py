@@ -1,5 +1,5 @@
 # ruff: noqa: E402 - rclpy can be imported once a backend is active
-"""The hardware bridge: who else commands the thrusters."""
+"""The hardware bridge refuses a second commander of the thrusters."""
 
 import time
 from types import SimpleNamespace
@@ -23,7 +23,7 @@ COMMAND = ros_type("finssim_msgs/msg/ThrusterCommand")
 
 @pytest.mark.parametrize("lives", [False, True])
 def test_a_second_publisher_stops_the_vehicle_however_short_it_lives(lives):
-    """One of the same name that is gone before anybody counts is a fault too; the first alone is none."""
+    """A publisher of the same name that leaves before a count is a fault too; the first one alone is not."""
     rclpy.init(
         args=["--ros-args", "-r", "__ns:=/alone"]
     )  # a killed graph of another test lingers on the wire

@@ -1,5 +1,5 @@
 # ruff: noqa: E402 - rclpy can be imported once a backend is active
-"""The example of a controller of one's own, on a simulator in lock-step, and the one clock of a domain."""
+"""The example of a custom controller on a simulator in lock-step, and the single clock of a domain."""
 
 import os
 import runpy
@@ -21,18 +21,18 @@ from nav_msgs.msg import Odometry
 
 EXAMPLE = Path(__file__).resolve().parents[4] / "examples" / "ros2" / "own_controller.py"
 TOPICS = EXAMPLE.with_name("topics.py")
-PATIENCE = 120.0  # [s] for processes to start on a machine that does much else
+PATIENCE = 120.0  # [s] for processes to start on a busy machine
 
 
 def finssim(*words):
-    """A process of the command."""
+    """Start a process of the command."""
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
     return subprocess.Popen([sys.executable, "-m", "finssim", *words], **pipes)
 
 
 @pytest.fixture(scope="module")
 def graph():
-    """The graph that the example names."""
+    """Graph that the example names."""
     line = next(line for line in EXAMPLE.read_text().splitlines() if line.startswith("finssim ros2 up"))
     process = finssim(*line.split()[1:])
     yield process
@@ -44,7 +44,7 @@ def graph():
 
 @pytest.mark.slow
 def test_a_controller_of_ones_own_holds_its_place(graph):
-    """Armed on demand, within 10 cm of the goal in 20 s of /clock, of which the node misses no step."""
+    """Armed on request, it is within 10 cm of the goal in 20 s of /clock and misses no step."""
     rclpy.init(args=[])
     node, stamps = runpy.run_path(str(EXAMPLE))["OwnController"](), []
     node.create_subscription(
@@ -60,7 +60,7 @@ def test_a_controller_of_ones_own_holds_its_place(graph):
 
 @pytest.mark.slow
 def test_topics_are_listed_without_an_installed_ros(graph):
-    """By the example, with their types."""
+    """The example lists them with their types."""
     words = [sys.executable, str(TOPICS), "list"]
     listed = subprocess.run(words, capture_output=True, text=True, timeout=PATIENCE)
     assert "/bluerov2_heavy/arm std_msgs/msg/Bool" in listed.stdout.splitlines(), listed.stderr
@@ -78,7 +78,7 @@ def test_a_message_is_filled_from_nested_values():
 
 @pytest.mark.slow
 def test_a_domain_has_one_clock(graph):
-    """A second world that would publish /clock does not start, and says why."""
+    """A second world that would publish /clock does not start, and reports the reason."""
     words = "ros2 node virtual_pool --ros-args -r __ns:=/other -p lockstep:=true -p camera:=none"
     second = finssim(*words.split())
     said, _ = second.communicate(timeout=PATIENCE)

@@ -1,5 +1,6 @@
 # ruff: noqa: E402 - rclpy can be imported once a backend is active
-"""The vehicle's own cameras, sonars and altimeters as ROS 2 messages: numbers, frames, and the node that sends them."""
+"""The vehicle's own cameras, sonars and altimeters as ROS 2 messages: numbers, frames, and the publishing
+node."""
 
 import math
 import socket
@@ -55,18 +56,19 @@ READINGS = (
 
 
 def made(reading):
-    """Its messages, by the last part of their keys."""
+    """Return the messages of a reading, by the last part of their keys."""
     return {key.split("/")[1]: make() for key, make in MAKE.of_own(STAMP, reading).items()}
 
 
 def in_link(name, vector):
-    """A direction of NAME_acoustic in NAME_link."""
+    """Return a direction of NAME_acoustic in NAME_link."""
     turned = quat_rotate(FRAMES[f"{name}_acoustic"][1], np.asarray(vector))
     return np.asarray(quat_rotate(quat_conjugate(FRAMES[f"{name}_link"][1]), turned))
 
 
 def test_a_picture_and_its_lens_are_those_of_the_camera():
-    """rgb8 bit for bit; K of 64 pixels across 80 degrees; the optical frame looks along the nose, x to the right."""
+    """rgb8 is bit-identical; K has 64 pixels across 80 degrees; the optical frame looks along the nose, x to
+    the right."""
     found = made(READINGS[0])
     image, info = found["image"], found["camera_info"]
     assert (image.encoding, image.step, image.header.frame_id) == ("rgb8", 192, "front_camera_optical")
@@ -80,7 +82,7 @@ def test_a_picture_and_its_lens_are_those_of_the_camera():
 
 
 def test_a_ping_has_its_beams_where_the_sonar_has_them():
-    """Directions in the sonar's own frame are those of its rays at elevation 0; beams of one range lie together."""
+    """Directions in the sonar's frame are those of its rays at elevation 0; beams of one range are adjacent."""
     device, ping = device_of(VEHICLE, "sonar"), made(READINGS[1])["sonar"]
     level = device.model_copy(update={"elevations": 1})
     for direction, ray in zip(ping.beam_directions, fan(level)[0, :, 1], strict=True):
@@ -92,7 +94,7 @@ def test_a_ping_has_its_beams_where_the_sonar_has_them():
 
 
 def test_four_beams_are_those_of_the_log():
-    """Unit vectors as its rays; the altitude is the mean of what came back, down the view."""
+    """Unit vectors are those of its rays; the altitude is the mean of the returned ranges along the view."""
     device, message = load_device("dvl_a50"), made(READINGS[3])["beams"]
     for vector, ray in zip(message.beam_unit_vec, cones(device)[0][:, 0, 1], strict=True):
         assert in_link("floor", xyz(vector)) == pytest.approx(ray, abs=1e-9)
@@ -104,7 +106,7 @@ def test_four_beams_are_those_of_the_log():
 
 
 def test_an_altimeter_tells_range_and_reach():
-    """As REP 117 has it, infinite where nothing is in reach."""
+    """The range is infinite without an object in reach (REP 117)."""
     message = made(READINGS[2])["range"]
     assert (message.range, message.radiation_type, message.max_range) == (2.5, 0, 100.0)
     assert message.field_of_view == pytest.approx(math.radians(25.0), abs=1e-4)
@@ -114,7 +116,7 @@ def test_an_altimeter_tells_range_and_reach():
 
 
 def test_what_the_messages_of_own_sensors_tell_is_what_was_measured():
-    """Pictures, echoes and ranges bit for bit; what is none is nothing."""
+    """Pictures, echoes and ranges are bit-identical; a missing reading gives None."""
     for reading, key in zip(READINGS[:3], ("image", "sonar", "range"), strict=True):
         told = own_reading(made(reading)[key])
         for field in ("image", "ranges"):
@@ -127,7 +129,7 @@ def test_what_the_messages_of_own_sensors_tell_is_what_was_measured():
 
 @pytest.mark.slow
 def test_the_camera_node_sends_what_comes_over_the_wire(tmp_path):
-    """Without an overhead camera: each reading on its topic, stamped with its exposure."""
+    """Without an overhead camera, each reading is published on its topic, stamped with its exposure."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
         wire = free.getsockname()
@@ -160,7 +162,7 @@ def test_the_camera_node_sends_what_comes_over_the_wire(tmp_path):
 
 @pytest.mark.slow
 def test_a_controller_hears_the_pictures_that_its_policy_sees(tmp_path):
-    """In colour, with the time of their exposure; none while nobody arms it, but the latest few."""
+    """Pictures come in colour with their exposure times; while disarmed only the latest few are kept."""
     rclpy.init(args=["--ros-args", "-r", "__ns:=/finsrov", "-p", f"policy:={seeing(tmp_path / 'policy')}"])
     try:
         controller, peer, end = ControllerNode(), Node("peer"), time.monotonic() + 30.0

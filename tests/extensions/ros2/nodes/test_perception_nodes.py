@@ -1,5 +1,5 @@
 # ruff: noqa: E402 - rclpy can be imported once a backend is active
-"""Pictures and telemetry go in as messages; where the vehicle truly is comes out as odometry."""
+"""Pictures and telemetry are sent as messages; odometry equals the true pose."""
 
 import math
 from dataclasses import replace
@@ -36,7 +36,7 @@ SENT = ("telemetry", "image", "picture", "tags")
 
 
 def chained(first, second):
-    """Position and quaternion of the second transform's child in the first one's parent."""
+    """Return position and quaternion of the second transform's child in the first one's parent."""
     first, second = (
         FramePose(np.array(xyz(t.translation)), np.array(xyzw(t.rotation)))
         for t in (first.transform, second.transform)
@@ -45,7 +45,7 @@ def chained(first, second):
 
 
 class Album:
-    """Pictures that are shown again and again."""
+    """Pictures that are shown repeatedly."""
 
     def __init__(self, pictures):
         self._next = cycle(pictures)
@@ -55,7 +55,7 @@ class Album:
 
 
 class Room:
-    """Both nodes, and a peer that is the vehicle's instruments and the camera."""
+    """Both nodes, and a peer that simulates the vehicle's instruments and the camera."""
 
     def __init__(self, folder, mode, *arguments):
         site, calibrated, settings = camera_of(VEHICLE, 1, "nominal")
@@ -87,7 +87,7 @@ class Room:
         self.drawn, self.broken = self.time.now, lambda telemetry: telemetry
 
     def instruments(self, show):
-        """Telemetry of the time, and a picture thirty times a second as `show` sends it."""
+        """Publish telemetry of the time and, thirty times a second, a picture by `show`."""
         now, stamp = self.time.now, self.time.ns
         reading = Reading(now, PLACE, TURN, np.zeros(6), True)
         exact = self.sensors.sample(reading, 0.01)
@@ -105,7 +105,7 @@ class Room:
             self.drawn = now
 
     def until(self, condition, show):
-        """Let it go on until a condition holds; whether it does in time."""
+        """Step until a condition is true; return whether it became true in time."""
         return self.time.until(condition, lambda: self.instruments(show))
 
     def tags(self, stamp, picture):
@@ -123,7 +123,7 @@ class Room:
 
 @pytest.fixture
 def room(tmp_path):
-    """Makes a room; nodes leave at the end."""
+    """Function that makes a room; its nodes leave at the end."""
     rooms = []
 
     def make(mode, *arguments):
@@ -138,7 +138,7 @@ def room(tmp_path):
 
 
 def check(room, tolerance, show):
-    """Fix and odometry are the true pose; the fix is of an exposure from now on."""
+    """Check that fix and odometry are the true pose, and that the fix is of an exposure from now on."""
     now = room.time.ns
     assert room.until(lambda: nanoseconds(room.heard["fix"][-1].header.stamp) > now, show)
     fix, odometry = room.heard["fix"][-1], room.heard["odometry"][-1]
@@ -151,7 +151,7 @@ def check(room, tolerance, show):
 
 
 def test_tags_of_the_camera_become_the_true_pose(room):
-    """Stamped in the middle of the exposure, with the frames that viewers need."""
+    """The pose is stamped in the middle of the exposure, with the frames that viewers need."""
     room = room("corners")
     sent = []
 
@@ -191,7 +191,7 @@ def test_tags_of_the_camera_become_the_true_pose(room):
 
 
 def test_bad_messages_never_raise_and_never_get_through(room):
-    """NaN in telemetry, broken JSON, pictures that are none: counted, and good ones still count."""
+    """NaN in telemetry, broken JSON and data that are not pictures are counted, and good messages still work."""
     room = room("corners")
     assert room.until(room.ready, room.tags)
     room.broken = lambda t: replace(t, gyro=(math.nan,) * 3, depth=math.inf, quaternion=(0.0,) * 4)
@@ -213,9 +213,9 @@ def test_bad_messages_never_raise_and_never_get_through(room):
 @pytest.mark.slow
 @pytest.mark.parametrize("form", ["image", "jpeg"])
 def test_pictures_become_the_true_pose(room, form):
-    """Raw and packed, drawn by the pool's camera; the tags that were found are told."""
+    """Raw and compressed pictures are drawn by the pool's camera; the detected tags are published."""
     room = room("pictures", "-p", f"image_transport:={'raw' if form == 'image' else 'compressed'}")
-    # Drawn beforehand, once and not in each turn.
+    # Drawn once beforehand, not in each turn.
     drawn = [room.camera.develop(e) for e in room.camera.exposures(0.0, 0.3, lambda t: (PLACE, TURN))]
     assert len(drawn) > 3
     room.camera = Album(drawn)

@@ -1,5 +1,5 @@
 # ruff: noqa: E402 - rclpy can be imported once a backend is active
-"""A team of three in one virtual pool, in lock-step: each goes its own way, and they hear each other late or not."""
+"""A team of three in one virtual pool, in lock-step: separate paths, and messages that are late or lost."""
 
 import runpy
 import socket
@@ -56,11 +56,11 @@ def free_port():
 
 
 class Ended(Exception):
-    """The graph is asked to end."""
+    """Request to end the graph."""
 
 
 class Team:
-    """The nodes that `finssim ros2 up pool --team` starts, in a thread of this process, and the example's driver."""
+    """Nodes of `finssim ros2 up pool --team` in a thread of this process, and the example's driver."""
 
     def __init__(self, folder):
         self.truth = folder / "truth"
@@ -114,7 +114,7 @@ class Team:
 
     def listen(self, key, topic, take):
         quality = quality_profile(TOPICS[key].quality)
-        quality.depth = 100  # several publishers latch their fixed frames, and only one would be kept
+        quality.depth = 100  # several publishers latch their fixed frames, and only one message would be kept
         self.driver.create_subscription(ros_type(TOPICS[key].type), topic, take, quality)
 
     def take(self, message):
@@ -143,7 +143,8 @@ def team(tmp_path_factory):
 
 @pytest.mark.slow
 def test_each_vehicle_is_driven_on_its_own(team, capsys):
-    """Arm, goal, path and teleoperation of three vehicles by the example; each where its own orders lead."""
+    """The example arms three vehicles and drives them by goal, path and teleoperation, each to its own
+    target."""
     team.late = team.example["drive"](team.driver)
     assert "heard" in capsys.readouterr().out
     for vehicle in team.driver.vehicles:
@@ -156,14 +157,15 @@ def test_each_vehicle_is_driven_on_its_own(team, capsys):
 
 @pytest.mark.slow
 def test_messages_come_late_and_some_are_lost(team):
-    """Processing and the way at 1500 m/s, in steps of the clock; a third is lost, and not for all receivers alike."""
+    """Delay is processing plus travel at 1500 m/s, in steps of the clock; a third is lost, differently by
+    receiver."""
     late = team.late
     for vehicle in team.driver.vehicles:
         delays = late[vehicle.name]
         ways = {v.name: np.linalg.norm(v.place - vehicle.place) / 1500.0 for v in team.driver.vehicles}
         for (sender, _), delay in delays.items():
             assert sender != vehicle.name
-            # It comes just before the time of /clock at which it has arrived.
+            # The message comes just before the time of /clock at which it has arrived.
             assert DELAY + ways[sender] - STEP - 1e-6 <= delay <= DELAY + ways[sender] + 4.0 * STEP
         assert abs(len(delays) / 40.0 - (1.0 - LOSS)) < 0.29  # four standard deviations
     numbers = [{key for key in late[name] if key[0] == "robot_1"} for name in ("robot_2", "robot_3")]
@@ -172,7 +174,7 @@ def test_messages_come_late_and_some_are_lost(team):
 
 @pytest.mark.slow
 def test_the_frames_are_one_tree(team):
-    """Every frame has one parent, and the way up ends at the one map, through the vehicle's own frames alone."""
+    """Every frame has one parent, and parents lead to the one map through the vehicle's own frames only."""
     mounted = {f"{name}/{frame}" for name in NAMES for frame in ("imu_link", "dvl_link")}
     assert mounted <= set(team.frames)
     assert all(len(parents) == 1 for parents in team.frames.values()) and "map" not in team.frames
@@ -186,7 +188,8 @@ def test_the_frames_are_one_tree(team):
 
 @pytest.mark.slow
 def test_nobody_hears_what_is_meant_for_the_other(team):
-    """A disarmed vehicle stops alone; a wrench in the other's frame moves nobody; places were true when driven."""
+    """Disarming stops one vehicle only; a wrench in another vehicle's frame moves none; estimates matched the
+    truth."""
     first, second, _ = team.driver.vehicles
     Bool, String = ros_type("std_msgs/msg/Bool"), ros_type("std_msgs/msg/String")
     arm = lambda v: v.arm.publish(Bool(data=True)) if not v.is_in(ARMED) else None  # noqa: E731

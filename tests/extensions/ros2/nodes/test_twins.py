@@ -1,5 +1,5 @@
 # ruff: noqa: E402 - rclpy can be imported once a backend is active
-"""A node, or a graph, is not started where one of its name lives already."""
+"""A node or a graph is not started while another of its name is alive."""
 
 import sys
 
@@ -18,12 +18,12 @@ from finssim.extensions.ros2.nodes import robot_node
 from finssim.extensions.ros2.nodes.robot_node import RobotNode
 
 LEASE = 10.0
-"""Time after which the wire forgets a process that was killed [s], of Cyclone DDS and Fast DDS."""
+"""Time after which the wire forgets a killed process [s], of Cyclone DDS and Fast DDS."""
 
 
 @pytest.fixture
 def other(monkeypatch):
-    """A context of its own in this process, as another process has one; nodes here wait for little."""
+    """Separate context in this process, as another process has one; nodes here wait only briefly."""
     monkeypatch.setattr(RobotNode, "urgent", False)
     monkeypatch.setattr(RobotNode, "listening", 0.0)
     assert robot_node.FORGOTTEN > LEASE
@@ -36,7 +36,8 @@ def other(monkeypatch):
 
 
 def test_a_node_that_is_there_already_is_not_started_again(other, capfd):
-    """A second one of its name and namespace waits, and ends with a sentence; when the first has left it lives."""
+    """A second node of the same name and namespace waits and ends with a sentence; after the first left, it
+    starts."""
     first = Node("camera", namespace="twins", context=other)
     words = ["ros2", "node", "camera", "--ros-args", "-r", "__ns:=/twins", "-p", "pool_file:=/none.yaml"]
     assert boundary.run(app, words) == 2
@@ -49,7 +50,7 @@ def test_a_node_that_is_there_already_is_not_started_again(other, capfd):
 
 
 def test_a_graph_is_not_started_where_one_of_its_nodes_lives(other, capfd):
-    """Before any process of it."""
+    """The refusal comes before any process starts."""
     Node("controller", namespace="finsrov", context=other)
     assert boundary.run(app, ["ros2", "up", "sim", "--duration", "0.1"]) == 2
     out, said = capfd.readouterr()
