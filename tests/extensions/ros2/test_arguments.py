@@ -1,4 +1,4 @@
-"""Command lines, parameter files and names are read as ROS 2 reads them."""
+"""Command lines, parameter files and names are read as in ROS 2."""
 
 import math
 import re
@@ -31,12 +31,12 @@ rov:
 
 @pytest.fixture
 def parameters(tmp_path):
-    """Assignments of the file above."""
+    """Assignments of the parameter file above."""
     return read(tmp_path, FILE)
 
 
 def read(tmp_path, *texts):
-    """Parameters of files with these texts, one after the other."""
+    """Return the parameters of files with these texts, one after the other."""
     overrides = {}
     for i, text in enumerate(texts):
         (tmp_path / f"{i}.yaml").write_text(text)
@@ -55,7 +55,7 @@ def read(tmp_path, *texts):
     ],
 )
 def test_files_reach_the_nodes_they_name(parameters, node, values):
-    """** is any number of names, * one, a later match wins, nested names are dotted."""
+    """** matches any number of names, * one; a later match wins, and nested names are dotted."""
     assert overrides_for(node, parameters) == values
 
 
@@ -75,7 +75,7 @@ def test_files_reach_the_nodes_they_name(parameters, node, values):
     ],
 )
 def test_files_that_rcl_refuses_are_refused(tmp_path, text, words):
-    """With the file's name, in one sentence, and as a RuntimeError like rclpy's."""
+    """The error is one sentence with the file's name, and a RuntimeError like rclpy's."""
     with pytest.raises(RosArgumentsError, match=re.escape(words)) as refused:
         read(tmp_path, text)
     assert "0.yaml" in str(refused.value) and isinstance(refused.value, RuntimeError)
@@ -101,12 +101,12 @@ WILD, NAMED = "/**: {ros__parameters: {policy: a}}\n", "/**/controller: {ros__pa
     ],
 )
 def test_a_pattern_keeps_the_rank_of_its_first_mention(tmp_path, texts, value):
-    """As rcl merges files: it is why a launch argument below /** lost against the package's own file."""
+    """rcl merges files in this order, so a launch argument below /** lost against the package's own file."""
     assert overrides_for("/x/controller", read(tmp_path, *texts)) == {"policy": value}
 
 
 def test_a_command_line_is_split_into_ros_and_the_rest():
-    """Everything between --ros-args and -- is for ROS."""
+    """All arguments between --ros-args and -- belong to ROS."""
     line = "prog --mine --ros-args -r a:=b -p n:gain:=2 --log-level debug -- --more".split()
     found = parse_arguments(line)
     assert found.rest == ["prog", "--mine", "--more"]
@@ -149,7 +149,7 @@ def test_of_values_of_several_types_one_type_counts(values, taken):
     ],
 )
 def test_malformed_arguments_are_refused(line):
-    """Instead of being left out."""
+    """They are not ignored."""
     with pytest.raises(RosArgumentsError):
         parse_arguments(["--ros-args", *line.split(maxsplit=1)])
 
@@ -185,7 +185,7 @@ def test_malformed_arguments_are_refused(line):
     ],
 )
 def test_values_have_the_type_they_look_like(text, value):
-    """As rcl's get_value reads them, which is neither YAML 1.1 nor 1.2."""
+    """Values are typed like those of rcl's get_value, which follows neither YAML 1.1 nor 1.2."""
     assert parsed_value(text) == value and type(parsed_value(text)) is type(value)
 
 
@@ -194,19 +194,19 @@ def test_values_have_the_type_they_look_like(text, value):
     [("odom", "/ns/odom"), ("/odom", "/odom"), ("~/odom", "/ns/me/odom"), ("a/b", "/ns/a/b")],
 )
 def test_short_names_stand_for_full_ones(short, full):
-    """Relative, absolute and private."""
+    """Names are relative, absolute or private."""
     assert expanded(short, "me", "/ns") == full
 
 
 @pytest.mark.parametrize("bad", ["", "1a", "a b", "/a/", "a//b", "a__b", "{node}"])
 def test_names_that_ros_refuses_are_refused(bad):
-    """Before they reach the wire."""
+    """The refusal comes before the name reaches the wire."""
     with pytest.raises(InvalidTopicNameException):
         expanded(bad, "me", "/")
 
 
 def test_the_first_fitting_rule_renames():
-    """Rules are compared by full names, and may be for one node alone."""
+    """Rules are compared by full names, and may apply to one node only."""
     rules = [Remap("other", "odom", "/x"), Remap("", "odom", "/y"), Remap("", "/ns/odom", "/z")]
     assert remapped("odom", "me", "/ns", rules) == "/y"
     assert remapped("/ns/odom", "other", "/ns", rules) == "/x"

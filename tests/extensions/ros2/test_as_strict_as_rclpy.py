@@ -1,5 +1,5 @@
 # ruff: noqa: E402 - rclpy can be imported once a backend is active
-"""What rclpy refuses, the built-in rclpy refuses: docs/reference/rclpy.md lists each rule with its test."""
+"""The built-in rclpy refuses what rclpy refuses: docs/reference/rclpy.md lists each rule with its test."""
 
 import array
 import ast
@@ -60,7 +60,7 @@ def node():
 
 
 def refused(node, name, value):
-    """Why a value is refused; "" if it is set."""
+    """Return the reason why a value is refused; "" if it is set."""
     (result,) = node.set_parameters([Parameter(name, value=value)])
     assert result.successful == (not result.reason)
     return result.reason
@@ -95,7 +95,7 @@ def test_errors_are_no_value_errors(error):
 
 
 def test_a_default_has_a_type(node):
-    """None only with dynamic typing, or with neither default nor descriptor; a Parameter.Type needs no default."""
+    """A default may be None with dynamic typing, or without a descriptor; a Parameter.Type needs no default."""
     with pytest.raises(ValueError, match="give a default"):
         node.declare_parameter("a", None, ParameterDescriptor())
     with pytest.raises(ValueError, match="NOT_SET"):
@@ -121,7 +121,7 @@ def test_a_parameter_has_a_name(node):
 
 
 def test_a_value_and_its_type_agree():
-    """ValueError where they do not, TypeError where the type is none."""
+    """A mismatch raises a ValueError, an invalid type a TypeError."""
     assert Parameter("a", Parameter.Type.STRING_ARRAY, []).value == []
     with pytest.raises(ValueError, match="is DOUBLE, found 1"):
         Parameter("a", Parameter.Type.DOUBLE, 1)
@@ -130,7 +130,7 @@ def test_a_value_and_its_type_agree():
 
 
 def test_an_empty_list_is_of_bytes(node):
-    """So it fits no list of another type."""
+    """An empty list therefore fits no list of another type."""
     node.declare_parameter("words", ["a"])
     assert "BYTE_ARRAY" in refused(node, "words", [])
 
@@ -152,7 +152,7 @@ def test_types_of_parameters_are_no_integers():
     ("value", "words"), [(2, "DOUBLE, found 2"), ("2.0", "STRING"), (True, "BOOL"), ([2.0], "ARRAY")]
 )
 def test_a_type_once_declared_stays(node, value, words):
-    """Without dynamic typing."""
+    """A value of another type is refused without dynamic typing."""
     node.declare_parameter("gain", 1.0)
     assert words in refused(node, "gain", value)
     node.declare_parameter("free", 1.0, FREE)
@@ -163,7 +163,7 @@ def test_a_type_once_declared_stays(node, value, words):
     ("value", "fits"), [(0, True), (2, True), (10, True), (3, False), (12, False), (-2, False)]
 )
 def test_integers_keep_their_range_and_steps(node, value, fits):
-    """The ends always fit."""
+    """The ends of a range always fit."""
     limits = ParameterDescriptor(integer_range=[IntegerRange(from_value=0, to_value=10, step=2)])
     node.declare_parameter("count", 4, limits)
     assert (not refused(node, "count", value)) == fits
@@ -174,7 +174,7 @@ def test_integers_keep_their_range_and_steps(node, value, fits):
     [(0.0, True), (0.3, True), (1.0, True), (0.35, False), (1.1, False), (float("nan"), False)],
 )
 def test_floats_keep_their_range_and_steps(node, value, fits):
-    """Within a millionth."""
+    """Range and steps are met within a millionth."""
     limits = ParameterDescriptor(
         floating_point_range=[FloatingPointRange(from_value=0.0, to_value=1.0, step=0.1)]
     )
@@ -189,7 +189,7 @@ def test_a_default_keeps_its_range_too(node):
 
 
 def test_a_range_of_integers_says_nothing_of_floats(node):
-    """Each range is for its own type."""
+    """Each range applies to its own type."""
     limits = ParameterDescriptor(integer_range=[IntegerRange(from_value=0, to_value=1)], dynamic_typing=True)
     assert node.declare_parameter("a", 5.0, limits).value == 5.0
 
@@ -203,7 +203,7 @@ def test_read_only_parameters_stay(node):
 
 
 def test_undeclared_parameters_are_refused(node):
-    """Read, set, described, typed or undeclared; set atomically, nothing is set."""
+    """They cannot be read, set, described, typed or undeclared; an atomic set with one of them sets nothing."""
     node.declare_parameter("known", 1)
     for act in (
         node.get_parameter,
@@ -226,7 +226,7 @@ def test_a_static_parameter_cannot_be_undeclared_by_setting_it(node):
 
 
 def test_an_empty_list_from_outside_gives_no_value(node):
-    """Nobody knows its type, so reading it is refused."""
+    """Its type is unknown, so reading it is refused."""
     given = Node("b", cli_args="--ros-args -p words:=[]".split())
     assert given.declare_parameter("words", ["a"]).value is None
     with pytest.raises(ParameterUninitializedException):
@@ -234,7 +234,7 @@ def test_an_empty_list_from_outside_gives_no_value(node):
 
 
 def test_arguments_of_the_node_win_over_those_of_the_process():
-    """And values in the program over both."""
+    """Values in the program win over both."""
     rclpy.init(args="--ros-args -p a:=1 -p b:=1 -p c:=1".split())
     given = Node(
         "b", cli_args="--ros-args -p a:=2 -p b:=2".split(), parameter_overrides=[Parameter("a", value=3)]
@@ -249,7 +249,7 @@ def test_a_wrong_type_of_use_sim_time_ends_the_node(node):
 
 
 def test_ros2_param_reaches_every_node(node):
-    """List, get and set by services, each answer as the node itself would give it; changes are on /parameter_events."""
+    """List, get and set work by services with the node's own answers; changes are on /parameter_events."""
     other, events = Node("b"), []
     other.create_subscription(ParameterEvent, "/parameter_events", events.append, 10)
     node.declare_parameter("limits.low", -1)
@@ -281,7 +281,7 @@ def test_ros2_param_reaches_every_node(node):
 
 
 def test_a_callback_can_refuse_what_is_set(node):
-    """And what is declared."""
+    """A callback can refuse a declaration, too."""
     node.add_on_set_parameters_callback(lambda ps: SetParametersResult(successful=False, reason="no"))
     with pytest.raises(InvalidParameterValueException, match="refused: no"):
         node.declare_parameter("a", 1)
@@ -306,7 +306,7 @@ def test_an_integer_field_takes_its_range_of_int(value):
     "value", [np.zeros(2), array.array("f", [1.0]), [1], (1.0, 2), b"ab", "ab", np.zeros((2, 2)), 1.0]
 )
 def test_a_sequence_of_floats_takes_lists_and_its_own_arrays(value):
-    """No NumPy array, as on Humble; what came in a message goes into another."""
+    """NumPy arrays are refused as on Humble; a field of one message can be assigned to another."""
     with pytest.raises(AssertionError):
         JointState(position=value)
     first = JointState(position=array.array("d", [1.0, 2.0]))
@@ -344,7 +344,7 @@ def test_a_profile_or_a_depth_is_needed(node, qos, error):
 
 
 def test_profiles_are_checked():
-    """A depth or a history, policies of their types, and no others."""
+    """A profile needs a depth or a history, and policies of the right types; no others are accepted."""
     with pytest.raises(InvalidQoSProfileException):
         QoSProfile()
     for wrong in (
@@ -359,7 +359,7 @@ def test_profiles_are_checked():
 
 
 def test_callbacks_take_as_many_arguments_as_they_get(node):
-    """Refused when made, not when the first message comes."""
+    """A wrong signature is refused at creation, not at the first message."""
     with pytest.raises(RuntimeError, match="expected 1 arguments"):
         node.create_subscription(String, "word", lambda: None, 10)
     with pytest.raises(TypeError):
@@ -381,7 +381,7 @@ def test_requests_are_of_their_service(node):
 
 @pytest.mark.parametrize("name", ["timers", "publishers", "subscriptions", "services", "clients", "context"])
 def test_what_a_node_has_is_not_assigned_to(node, name):
-    """Names that a node's own attributes must not take."""
+    """Subclasses must not assign to attributes of a node."""
     with pytest.raises(AttributeError):
         setattr(node, name, [])
 
@@ -393,12 +393,12 @@ OF_RCLPY = (
     "_post_set_parameters_callbacks _type_description_service timers publishers subscriptions services clients guards "
     "waitables executor context handle default_callback_group"
 ).split()
-"""Attributes of rclpy's Node (node.py): one of ours by that name would break the node there and not here."""
+"""Attributes of rclpy's Node (node.py): a FinsSim attribute of the same name would break the node only there."""
 
 
 @pytest.mark.parametrize("name", NODES)
 def test_our_nodes_take_no_name_of_rclpys_node(name):
-    """Neither assigned nor defined."""
+    """The nodes of FinsSim neither assign nor define these names."""
     module, _, cls = NODES[name].partition(":")
     tree = ast.parse(Path(importlib.util.find_spec(module).origin).read_text())
     shared = ast.parse(
@@ -421,7 +421,7 @@ def test_timers_do_not_run_backwards(node):
 
 
 def test_what_was_destroyed_is_not_used(node):
-    """A RuntimeError, and nothing on the wire."""
+    """Use after destruction is a RuntimeError and sends nothing."""
     publisher, other = node.create_publisher(String, "word", 10), Node("b")
     node.destroy_publisher(publisher)
     with pytest.raises(InvalidHandle, match="was destroyed"):
@@ -432,7 +432,7 @@ def test_what_was_destroyed_is_not_used(node):
 
 
 def test_a_callback_does_not_spin(node):
-    """Neither its own executor nor for an answer."""
+    """A callback may spin neither its own executor nor for an answer."""
     found = []
 
     def callback():
@@ -486,6 +486,6 @@ def test_names_of_topics_have_a_longest_length(node):
 
 
 def test_init_refuses_bad_arguments():
-    """A RuntimeError, as rclpy's own."""
+    """The error is a RuntimeError, like rclpy's."""
     with pytest.raises(RuntimeError, match="NAME:=VALUE"):
         rclpy.init(args=["--ros-args", "-p", "gain"])

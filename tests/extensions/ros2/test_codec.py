@@ -1,4 +1,4 @@
-"""Bytes on the wire are those of the CDR standard, written out by hand; hashes those of REP-2011."""
+"""Wire bytes equal hand-written CDR; type hashes follow REP-2011."""
 
 import hashlib
 import json
@@ -14,7 +14,7 @@ CODEC = codec_of("jazzy")
 
 
 def message(name, **values):
-    """A message of a type."""
+    """Return a message of a type."""
     return CODEC.message(name)(**values)
 
 
@@ -39,9 +39,9 @@ def test_doubles_are_aligned_to_eight_after_the_header():
 
 
 def test_a_thruster_command_in_bytes():
-    """Our own message: header, source, names, a gap up to eight, forces."""
+    """FinsSim's own message: header, source, names, a gap up to eight, forces."""
     made = message("finssim_msgs/msg/ThrusterCommand", source="pid", names=["a", "bc"], force=[1.5, -0.25])
-    body = struct.pack("<iII", 0, 0, 1) + b"\0\0\0\0"  # stamp, frame_id "" and its gap
+    body = struct.pack("<iII", 0, 0, 1) + b"\0\0\0\0"  # stamp, frame_id "" and its padding
     body += struct.pack("<I", 4) + b"pid\0" + struct.pack("<I", 2)
     body += struct.pack("<I", 2) + b"a\0\0\0" + struct.pack("<I", 3) + b"bc\0\0"
     body += struct.pack("<I", 2)
@@ -72,7 +72,7 @@ def test_every_known_type_survives_its_own_bytes(distro):
 
 
 def test_values_survive_their_bytes():
-    """Odometry with numbers everywhere."""
+    """Odometry with numbers in all fields survives."""
     made = message("nav_msgs/msg/Odometry", child_frame_id="base_link")
     made.pose.pose.position.z, made.twist.twist.angular.x = -0.7, 1e-9
     made.pose.covariance = np.arange(36.0)
@@ -83,20 +83,20 @@ def test_values_survive_their_bytes():
 
 
 def test_big_endian_bytes_are_read_too():
-    """The header's second byte tells the order."""
+    """The header's second byte contains the byte order."""
     assert CODEC.deserialize(b"\x00\x00\x00\x00" + struct.pack(">d", 2.5), "std_msgs/msg/Float64").data == 2.5
 
 
 @pytest.mark.parametrize("length", range(16))
 def test_cut_bytes_are_refused_in_one_sentence(length):
-    """A message that ends too early raises our error and no other."""
+    """A truncated message raises the codec's own error and no other."""
     data = bytes(CODEC.serialize(message("std_msgs/msg/Header", frame_id="odometry")))[:length]
     with pytest.raises(Ros2Error, match="std_msgs/msg/Header"):
         CODEC.deserialize(data, "std_msgs/msg/Header")
 
 
 def test_quaternions_begin_as_no_rotation():
-    """As in ROS 2, where w is 1."""
+    """The default of w is 1 as in ROS 2."""
     assert message("geometry_msgs/msg/Pose").orientation.w == 1.0
 
 
@@ -115,20 +115,20 @@ def test_quaternions_begin_as_no_rotation():
     ],
 )
 def test_what_real_rclpy_refuses_is_refused_here(field, value):
-    """A field takes its own type only, and says so by an AssertionError, as on Humble."""
+    """A field accepts only its own type and raises an AssertionError otherwise, as on Humble."""
     image = message("sensor_msgs/msg/Image")
     with pytest.raises(AssertionError, match=field):
         setattr(image, field, value)
 
 
 def test_a_float_field_refuses_an_integer():
-    """Humble asserts; so code that runs here runs there."""
+    """Humble asserts the type, so code that runs here also runs there."""
     with pytest.raises(MessageError, match="write 1.0"):
         message("std_msgs/msg/Float64", data=1)
 
 
 def test_unknown_fields_are_refused():
-    """In the constructor and by assignment."""
+    """They are refused in the constructor and in assignments."""
     with pytest.raises(MessageError, match="no field 'w'"):
         message("geometry_msgs/msg/Point", w=1.0)
     with pytest.raises(AttributeError, match="no field 'w'"):
@@ -136,13 +136,13 @@ def test_unknown_fields_are_refused():
 
 
 def test_fixed_arrays_keep_their_length():
-    """36 covariances are 36."""
+    """An array of 36 covariances must have 36 values."""
     with pytest.raises(MessageError, match="expected 36 elements, found 35"):
         message("geometry_msgs/msg/PoseWithCovariance", covariance=[0.0] * 35)
 
 
 def test_arrays_that_came_over_the_wire_are_writable():
-    """As in rclpy: a node may correct what it received."""
+    """As in rclpy, a node may correct a received message."""
     data = CODEC.serialize(message("geometry_msgs/msg/PoseWithCovariance"))
     back = CODEC.deserialize(bytearray(data), "geometry_msgs/msg/PoseWithCovariance")
     back.covariance[0] = 1.0
@@ -150,13 +150,13 @@ def test_arrays_that_came_over_the_wire_are_writable():
 
 
 def test_constants_belong_to_the_class():
-    """ThrusterState.FAULT, and octets as bytes."""
+    """Constants such as ThrusterState.FAULT are class attributes, and octets are bytes."""
     assert CODEC.message("finssim_msgs/msg/ThrusterState").FAULT == 3
     assert CODEC.message("diagnostic_msgs/msg/DiagnosticStatus").STALE == b"\x03"
 
 
 def test_fields_are_spelled_as_ros_spells_them():
-    """get_fields_and_field_types of a real Odometry and of arrays."""
+    """get_fields_and_field_types is that of a real Odometry, and of arrays."""
     assert CODEC.message("nav_msgs/msg/Odometry").get_fields_and_field_types() == {
         "header": "std_msgs/Header",
         "child_frame_id": "string",
@@ -168,21 +168,21 @@ def test_fields_are_spelled_as_ros_spells_them():
 
 
 def test_defaults_in_a_definition_hold():
-    """A field's default, as `.msg` files may give it."""
+    """A `.msg` file may give the default of a field."""
     definitions = Definitions("jazzy")
     definitions.add_message("mine_msgs/msg/Gain", 'float64 gain 2.5 # why\nstring name "abc"\nint32 plain\n')
     assert definitions.defaults["mine_msgs/msg/Gain"] == {"gain": 2.5, "name": "abc"}
 
 
 def test_another_definition_under_a_known_name_is_refused():
-    """Two layouts under one name would garble the wire."""
+    """Two layouts under one name would corrupt messages."""
     with pytest.raises(Ros2Error, match="nav_msgs/msg/Odometry"):
         Definitions("jazzy").add_message("nav_msgs/msg/Odometry", "float64 x\n")
 
 
 @pytest.mark.parametrize(("length", "distro"), [(24, "humble"), (16, "iron"), (16, "jazzy")])
 def test_identifiers_in_the_node_list_have_the_length_of_the_release(length, distro):
-    """24 bytes up to Humble, 16 since Iron."""
+    """Identifiers have 24 bytes up to Humble, and 16 since Iron."""
     assert len(codec_of(distro).message("rmw_dds_common/msg/Gid")().data) == length
 
 
@@ -207,7 +207,7 @@ OURS = {f"finssim_msgs/msg/{p.stem}": p.read_text() for p in INTERFACES.glob("fi
 
 
 def described(name):
-    """REP-2011's description of one type, from its text."""
+    """Return REP-2011's description of one type from its text."""
     fields = []
     for line in {**STANDARD, **OURS}[name].splitlines():
         words = line.split("#")[0].split()
@@ -225,14 +225,14 @@ def described(name):
 
 
 def referenced(name):
-    """All types below one."""
+    """Return all types that a type references, directly or indirectly."""
     nested = {f["type"]["nested_type_name"] for f in described(name)["fields"]} - {""}
     return nested.union(*(referenced(n) for n in nested))
 
 
 @pytest.mark.parametrize("name", [*STANDARD, *OURS])
 def test_type_hashes_follow_the_rule(name):
-    """RIHS01: SHA-256 over the canonical JSON of a type and of those below it, by name."""
+    """RIHS01 is the SHA-256 of the canonical JSON of a type and of its referenced types, by name."""
     below = [described(n) for n in sorted(referenced(name))]
     text = json.dumps({"type_description": described(name), "referenced_type_descriptions": below})
     assert CODEC.type_hash(name) == f"RIHS01_{hashlib.sha256(text.encode()).hexdigest()}"
@@ -242,7 +242,7 @@ def test_type_hashes_follow_the_rule(name):
     ("name", "published"),
     [
         ("std_msgs/msg/String", "df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"),
-        # Of `char`, which rosidl takes for uint8: what every participant of Iron and later announces.
+        # Hash for `char`, which rosidl treats as uint8: every participant of Iron and later announces it.
         (
             "rmw_dds_common/msg/ParticipantEntitiesInfo",
             "91a0593bacdcc50ea9bdcf849a938b128412cc1ea821245c663bcd26f83c295e",

@@ -1,5 +1,5 @@
 # ruff: noqa: E402 - rclpy can be imported once a backend is active
-"""What a node learns about the graph, as rclpy tells it."""
+"""Graph queries of a node give the results of rclpy."""
 
 import time
 
@@ -23,7 +23,7 @@ LATCHED = QoSProfile(
 
 @pytest.fixture(scope="module")
 def nodes():
-    """Two nodes: the first publishes, the second listens, serves and asks."""
+    """Two nodes: the first publishes; the second has a subscription, a service and a client."""
     rclpy.init(args=[])
     talker, listener = Node("talker", namespace="ns"), Node("listener")
     talker.create_publisher(String, "word", LATCHED)
@@ -35,7 +35,7 @@ def nodes():
 
 
 def awaited(ask, number=1):
-    """What a query gives once it finds that many, as discovery takes a moment."""
+    """Return the result of a query once it has that many entries, as discovery takes time."""
     end = time.monotonic() + 10.0
     while len(ask()) < number and time.monotonic() < end:
         time.sleep(0.01)
@@ -43,7 +43,7 @@ def awaited(ask, number=1):
 
 
 def test_publishers_of_a_topic_tell_node_type_and_policies(nodes):
-    """Relative names and remapping as for `create_publisher`."""
+    """Relative names and remapping work as for `create_publisher`."""
     talker, listener = nodes
     (info,) = awaited(lambda: talker.get_publishers_info_by_topic("word"))
     assert (info.node_name, info.node_namespace) == ("talker", "/ns")
@@ -64,7 +64,7 @@ def test_publishers_of_a_topic_tell_node_type_and_policies(nodes):
 
 
 def test_subscriptions_of_a_topic_tell_their_node(nodes):
-    """And counts agree with them."""
+    """Counts agree with the subscriptions."""
     talker, listener = nodes
     (info,) = awaited(lambda: listener.get_subscriptions_info_by_topic("/ns/word"))
     assert (info.node_name, info.node_namespace) == ("listener", "/")
@@ -75,7 +75,7 @@ def test_subscriptions_of_a_topic_tell_their_node(nodes):
 
 
 def test_names_come_with_their_types(nodes):
-    """Of the whole graph, and of one node."""
+    """Names and types are listed for the whole graph and for one node."""
     talker, listener = nodes
     assert awaited(talker.get_node_names, 2) == ["listener", "talker"]
     assert ("/ns/word", ["std_msgs/msg/String"]) in talker.get_topic_names_and_types()
@@ -94,7 +94,7 @@ def test_names_come_with_their_types(nodes):
 
 
 def test_who_has_left_is_neither_found_nor_kept(nodes):
-    """However many come and go: each query reads what is new."""
+    """Any number of endpoints may come and go: each query reads only new ones."""
     talker, listener = nodes
     for _ in range(20):
         gone = listener.create_publisher(String, "fleeting", 1)

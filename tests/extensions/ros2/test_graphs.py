@@ -1,4 +1,4 @@
-"""Which nodes a graph has, what they are told, and that the page tells the same."""
+"""Nodes of each graph and their parameters agree with the page."""
 
 import importlib.util
 import re
@@ -26,13 +26,13 @@ FILE = Path("/somewhere/pool.yaml")
 
 
 def source(node):
-    """Source of a node's module."""
+    """Return the source of a node's module."""
     return Path(importlib.util.find_spec(NODES[node].partition(":")[0]).origin).read_text()
 
 
 @pytest.mark.parametrize("node", NODES)
 def test_each_node_is_a_class_and_stands_on_the_page(node):
-    """With every parameter that it declares."""
+    """The page lists every parameter that the node declares."""
     assert f"\nclass {NODES[node].partition(':')[2]}(RobotNode):" in source(node)
     (row,) = re.findall(rf"^\| {node} \| .*$", PAGE, flags=re.MULTILINE)
     declared = set(re.findall(r'self\.parameter\("(\w+)"', source(node)))
@@ -40,7 +40,7 @@ def test_each_node_is_a_class_and_stands_on_the_page(node):
 
 
 def test_graphs_are_made_of_nodes():
-    """And the pool's is a robot in a pool."""
+    """The pool's graph is the robot's with a virtual pool."""
     assert {node for nodes in GRAPHS.values() for node in nodes} <= set(NODES)
     assert GRAPHS["pool"] == ("virtual_pool", *GRAPHS["robot"])
 
@@ -49,7 +49,7 @@ AUTOPILOT = {"firmware": "ardusub", "vehicle": "bluerov2_heavy", "port": 6000}
 
 
 def told(graph, tmp_path, **choices):
-    """Parameters of the file that nodes are started with: node -> parameters; ** what all have."""
+    """Return the parameters of the nodes' file: node -> parameters; ** for parameters that all share."""
     plan = plan_of(graph, Options.of(choices), FILE)
     plan.write(tmp_path / "p.yaml")
     tree = yaml.safe_load((tmp_path / "p.yaml").read_text())
@@ -97,13 +97,13 @@ def told(graph, tmp_path, **choices):
     ],
 )
 def test_choices_reach_their_node(tmp_path, graph, choices, node, parameters):
-    """Each option becomes a parameter of the node that it is for."""
+    """Each option becomes a parameter of the node that uses it."""
     found = told(graph, tmp_path, **choices)
     assert parameters.items() <= found[node].items()
 
 
 def test_extra_nodes_are_started_where_asked_for():
-    """Recorder and teleoperation."""
+    """Extra nodes are the recorder and teleoperation."""
 
     def nodes(graph, **choices):
         return tuple(one.node for one in plan_of(graph, Options.of(choices), FILE).nodes)
@@ -114,7 +114,8 @@ def test_extra_nodes_are_started_where_asked_for():
 
 
 def test_each_vehicle_of_a_team_has_its_own_names_ports_and_share():
-    """One world for all; namespaces, frames, tag ids, ports ten apart, goals and records by vehicle."""
+    """Vehicles share one world; namespaces, frames, tag ids, ports ten apart, goals and records are per
+    vehicle."""
     goals = "0,0,-1,0; 2,0,-1,0; 4,0,-1,0"
     choices = {"team": "finsrov,finsrov,lauv", "site": "open-water", "goal": goals, "record": Path("r")}
     plan = plan_of("pool", Options.of({**choices, "lockstep": True}), FILE)
@@ -133,7 +134,8 @@ def test_each_vehicle_of_a_team_has_its_own_names_ports_and_share():
 
 @pytest.mark.parametrize("graph", GRAPHS)
 def test_time_of_a_graph_is_that_of_its_world(graph):
-    """In lock-step and with a factor all nodes but the world live by /clock; otherwise those of a simulator alone."""
+    """In lock-step and with a factor, all nodes but the world use /clock; otherwise only those of a simulator
+    do."""
 
     def lives(**choices):
         file = {} if graph != "robot" else {"pool_file": FILE}
@@ -149,7 +151,7 @@ def test_time_of_a_graph_is_that_of_its_world(graph):
 
 
 def test_every_option_of_a_node_is_a_parameter_of_it():
-    """By its name, in the node's source or in that of every node."""
+    """The parameter is declared by the option's name in the node's source or in that of every node."""
     for node, names in NODE_PARAMETERS.items():
         assert not [name for name in names.split() if f'self.parameter("{name}"' not in source(node)]
     common = Path(importlib.util.find_spec("finssim.extensions.ros2.nodes.robot_node").origin).read_text()
@@ -190,13 +192,13 @@ def test_every_option_of_a_node_is_a_parameter_of_it():
     ],
 )
 def test_what_cannot_be_started_is_refused_in_a_sentence(graph, choices, error, words):
-    """Before any process."""
+    """The refusal comes before any process starts."""
     with pytest.raises(error, match=re.escape(words)):
         plan_of(graph, Options.of(choices), FILE)
 
 
 def test_topics_are_those_of_the_nodes():
-    """Full names; a simulator has no camera."""
+    """Full names are listed; a simulator has no camera."""
     names = {
         name for name, _ in topics_of(plan_of("sim", Options(names=VehicleNames(namespace="rov")), None))
     }
@@ -215,7 +217,7 @@ def test_topics_are_those_of_the_nodes():
     ],
 )
 def test_the_command_refuses_in_a_sentence(capsys, words, sentence):
-    """With status 2, and nothing started."""
+    """The status is 2, and nothing is started."""
     from finssim.cli import boundary
     from finssim.cli.commands import app
 

@@ -1,4 +1,4 @@
-"""Our message files are legal ROS 2, and the workspace builds from the very same ones."""
+"""FinsSim's message files are valid in ROS 2, and the workspace builds from identical files."""
 
 import ast
 import contextlib
@@ -27,13 +27,13 @@ from finssim.robot.wiring import POOL_ADDRESS
 from finssim.vehicles.loader import catalogue
 
 MESSAGES = sorted(INTERFACES.glob("finssim_msgs/msg/*.msg"))
-"""Ours; those of sonars are marine_msgs', which a ROS 2 has of its own."""
+"""FinsSim's messages; those of sonars are marine_msgs', which a ROS 2 installation provides itself."""
 WORKSPACE = Path(__file__).resolve().parents[3] / "ros2_ws" / "src"
 NODES = WORKSPACE / "finssim_ros"
 
 
 def names(path):
-    """Name and text of each message file in a folder."""
+    """Return name and text of each message file in a folder."""
     return {file.name: file.read_text() for file in path.glob("*.msg")}
 
 
@@ -52,7 +52,7 @@ def test_cmake_builds_every_message():
 
 @pytest.mark.parametrize("path", MESSAGES, ids=lambda path: path.stem)
 def test_messages_begin_with_a_header_and_hold_no_char(path):
-    """`char` hashes differently between implementations, and everything we send has a time."""
+    """`char` hashes differently between implementations, and every published message has a time."""
     lines = [line.split("#")[0].split() for line in path.read_text().splitlines()]
     fields = [words for words in lines if len(words) == 2 and "=" not in words[1]]
     assert fields[0] == ["std_msgs/Header", "header"]
@@ -60,7 +60,7 @@ def test_messages_begin_with_a_header_and_hold_no_char(path):
 
 
 def has_rosidl():
-    """Whether the system's Python has ROS 2's own parser."""
+    """Return whether the system's Python has ROS 2's own parser."""
     try:
         probe = subprocess.run(["/usr/bin/python3", "-c", "import rosidl_adapter.msg"], capture_output=True)
     except OSError:
@@ -71,7 +71,7 @@ def has_rosidl():
 @pytest.mark.slow
 @pytest.mark.skipif(not has_rosidl(), reason="needs apt-get install python3-rosidl python3-lark python3-empy")
 def test_the_official_parser_takes_every_message(tmp_path):
-    """rosidl_adapter turns each into IDL."""
+    """rosidl_adapter converts each message into IDL."""
     script = (
         "import sys, pathlib; from rosidl_adapter.msg import convert_msg_to_idl\n"
         "root, out = map(pathlib.Path, sys.argv[1:])\n"
@@ -84,7 +84,7 @@ def test_the_official_parser_takes_every_message(tmp_path):
 
 @pytest.mark.parametrize("package", ["finssim_msgs", "finssim_ros"])
 def test_packages_are_named_as_their_folders(package):
-    """colcon goes by package.xml."""
+    """colcon uses the name in package.xml."""
     root = ElementTree.parse(WORKSPACE / package / "package.xml").getroot()
     assert root.findtext("name") == package and root.get("format") == "3"
     build = root.findtext("export/build_type")
@@ -92,7 +92,7 @@ def test_packages_are_named_as_their_folders(package):
 
 
 def test_messages_depend_on_every_package_they_use():
-    """A package left out of package.xml builds only by luck."""
+    """A package left out of package.xml builds only by chance."""
     root = ElementTree.parse(WORKSPACE / "finssim_msgs/package.xml").getroot()
     used = {
         w.split("/")[0] for p in MESSAGES for w in p.read_text().split() if w.count("/") == 1 and "_" in w
@@ -103,7 +103,8 @@ def test_messages_depend_on_every_package_they_use():
 
 
 def test_nodes_depend_on_every_package_whose_types_they_use():
-    """Topics, services and what nodes, launch files and examples import; nothing else, but for the environment."""
+    """These are topics, services and imports of nodes, launch files and examples; nothing else but the
+    environment."""
     root = ElementTree.parse(NODES / "package.xml").getroot()
     own = [topic for topics in OWN_TOPICS.values() for topic in topics.values()]
     used = {kind.type.split("/")[0] for kind in (*TOPICS.values(), *SERVICES.values(), *own)}
@@ -128,7 +129,7 @@ def test_python_of_the_workspace_compiles_on_humble(path):
 
 
 def entry_points():
-    """Names that setup.py installs."""
+    """Return the names that setup.py installs."""
     tree = ast.parse((NODES / "setup.py").read_text())
     nodes = next(n for n in tree.body if isinstance(n, ast.Assign) and n.targets[0].id == "NODES")
     return {element.value for element in nodes.value.elts}
@@ -136,10 +137,10 @@ def entry_points():
 
 @pytest.fixture
 def launched(monkeypatch, tmp_path):
-    """Runs a launch file with arguments; gives executable -> command line, as launch_ros makes it.
+    """Function that runs a launch file with arguments and returns executable -> command line, as launch_ros makes it.
 
-    launch and launch_ros are not on PyPI. What stands in for them here does what launch_ros/actions/node.py does with
-    names and parameters: a dictionary becomes a file, below the node's full name if name and namespace are given.
+    launch and launch_ros are not on PyPI. Their replacement here treats names and parameters like
+    launch_ros/actions/node.py: a dictionary becomes a file, below the node's full name if name and namespace are given.
     """
 
     names = []
@@ -189,7 +190,7 @@ def launched(monkeypatch, tmp_path):
 
 
 def parameters_of(lines, node, namespace="finsrov"):
-    """What a node gets of its command line."""
+    """Return the parameters that a node reads from its command line."""
     return overrides_for(f"/{namespace}/{node}", parse_arguments(lines[node]).parameters)
 
 
@@ -222,7 +223,7 @@ def parameters_of(lines, node, namespace="finsrov"):
     ],
 )
 def test_launch_arguments_win_over_parameter_files(launched, tmp_path, graph, given, node, parameters):
-    """Files that begin with /** lose against what is given at launch, and win over what is not."""
+    """Files that begin with /** lose against launch arguments, and win over their defaults."""
     file = tmp_path / "own.yaml"
     file.write_text("/**:\n  ros__parameters: {policy: a, robot: b, goal: c, port: 1, seed: 9, rate: 30.0}\n")
     given = {**given, "params_file": str(file)}
@@ -232,7 +233,7 @@ def test_launch_arguments_win_over_parameter_files(launched, tmp_path, graph, gi
 
 
 def defaults_of(node):
-    """Parameter -> default of a node, as its source and that of every node declare them."""
+    """Return parameter -> default of a node, as declared in its source and in that of every node."""
     module = importlib.import_module(GRAPH_NODES[node].partition(":")[0])
     found = {}
     for part in (importlib.import_module("finssim.extensions.ros2.nodes.robot_node"), module):
@@ -243,7 +244,7 @@ def defaults_of(node):
                 and len(call.args) == 2
             ):
                 name, default = call.args
-                with contextlib.suppress(NameError):  # one that depends on the vehicle
+                with contextlib.suppress(NameError):  # a default that depends on the vehicle
                     found[ast.literal_eval(name)] = eval(ast.unparse(default), vars(part))
     return found
 
@@ -269,7 +270,7 @@ EQUAL = [
 
 @pytest.mark.parametrize(("graph", "given"), EQUAL)
 def test_launch_files_start_what_up_starts(launched, graph, given):
-    """The same namespace, the same nodes, each parameter the same."""
+    """The namespace, the nodes and each parameter are the same."""
     pytest.importorskip("cyclonedds")
     activate(announce=False)
     convert = {"seed": int, "port": int, "real_time_factor": float, "record": Path, "lockstep": bool}
@@ -287,7 +288,7 @@ def test_launch_files_start_what_up_starts(launched, graph, given):
 
 
 def test_one_launch_file_starts_a_team(launched):
-    """One world, and the nodes of each vehicle in its namespace."""
+    """It starts one world, and the nodes of each vehicle in its namespace."""
     plan = graph_launched(
         "pool",
         {"team": "finsrov,finsrov,finsrov", "site": "open-water", "message_loss": "0.2", "record": "runs"},
@@ -302,7 +303,7 @@ def test_one_launch_file_starts_a_team(launched):
 
 
 def test_every_launch_file_takes_the_options_of_up(launched):
-    """All but arming, which needs a message, and the duration."""
+    """Exceptions are arming, which needs a message, and the duration."""
     for graph in ("sim", "robot", "pool"):
         *declared, _ = runpy.run_path(str(NODES / f"launch/{graph}.launch.py"))[
             "generate_launch_description"
@@ -312,7 +313,7 @@ def test_every_launch_file_takes_the_options_of_up(launched):
 
 
 def test_a_number_that_is_none_is_refused(launched):
-    """At launch, before any process."""
+    """The refusal comes at launch, before any process starts."""
     for given, sentence in (
         ({"seed": "x"}, "seed:=x: expected an integer"),
         ({"lockstep": "1"}, "lockstep:=1: expected true or false"),
@@ -322,7 +323,7 @@ def test_a_number_that_is_none_is_refused(launched):
 
 
 def test_a_recorder_is_started_where_a_parameter_file_names_its_file(launched, tmp_path):
-    """As launch files always did; otherwise only with record:=."""
+    """Launch files have always done so; without such a parameter only record:= starts one."""
     path = tmp_path / "own.yaml"
     path.write_text("/**/recorder:\n  ros__parameters: {record: a.mcap}\n")
     lines = launched("robot", params_file=str(path))
@@ -331,7 +332,7 @@ def test_a_recorder_is_started_where_a_parameter_file_names_its_file(launched, t
 
 
 def test_a_parameter_file_of_ones_own_keeps_what_launch_does_not_say(launched, tmp_path):
-    """Nothing that a launch file would have as default."""
+    """Defaults of a launch file do not override it."""
     path = tmp_path / "own.yaml"
     path.write_text("/**:\n  ros__parameters: {vehicle: lauv, policy: runs/a, rate: 30.0}\n")
     lines = launched("robot", params_file=str(path), namespace="deep/blue")
@@ -346,7 +347,7 @@ def test_a_parameter_file_of_ones_own_keeps_what_launch_does_not_say(launched, t
 
 
 def test_launch_files_start_what_is_installed(launched):
-    """Every executable has an entry point, and every node is one."""
+    """Every executable has an entry point, and every node is an executable."""
     started = [set(launched(graph)) for graph in ("sim", "pool", "robot")] + [
         set(launched("robot", teleop="joy", record="a.mcap"))
     ]
@@ -358,7 +359,7 @@ def test_launch_files_start_what_is_installed(launched):
 
 
 def test_vehicles_that_pages_and_launch_files_name_exist():
-    """After `vehicle:=` and `--vehicle`."""
+    """Vehicles after `vehicle:=` and `--vehicle` exist."""
     pages = WORKSPACE.parents[1] / "docs"
     files = [*NODES.rglob("*.py"), pages / "ros2.md", pages / "reference" / "ros2_installation.md"]
     named = {m for file in files for m in re.findall(r"(?:vehicle:=|--vehicle )([\w-]+)", file.read_text())}

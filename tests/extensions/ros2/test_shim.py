@@ -1,5 +1,5 @@
 # ruff: noqa: E402 - rclpy can be imported once a backend is active
-"""The built-in rclpy behaves as the real one where node code can tell."""
+"""The built-in rclpy behaves like the real one in every respect that node code can observe."""
 
 import os
 import subprocess
@@ -42,14 +42,14 @@ PATIENCE = 10.0
 
 @pytest.fixture
 def context():
-    """On the wire for one test."""
+    """Context on the wire for one test."""
     rclpy.init(args=[])
     yield rclpy.get_default_context()
     rclpy.try_shutdown()
 
 
 def until(node, condition, each=lambda: None):
-    """Spin until a condition holds; whether it does in time."""
+    """Spin until a condition is true; return whether it became true in time."""
     end = time.monotonic() + PATIENCE
     while not condition() and time.monotonic() < end:
         each()
@@ -58,13 +58,13 @@ def until(node, condition, each=lambda: None):
 
 
 def test_nodes_need_init():
-    """As in rclpy."""
+    """A node without init is refused as in rclpy."""
     with pytest.raises(NotInitializedException, match=r"rclpy.init\(\)"):
         Node("early")
 
 
 def test_init_works_again_after_shutdown():
-    """A test suite or a notebook does so."""
+    """Test suites and notebooks call init again."""
     for name in ("first", "second"):
         rclpy.init(args=[])
         with pytest.raises(RuntimeError, match="only be called once"):
@@ -75,7 +75,7 @@ def test_init_works_again_after_shutdown():
 
 
 class Hand(Clock):
-    """A clock that shows what we set [ns]."""
+    """Clock with a time set by the test [ns]."""
 
     shown = 0
 
@@ -84,11 +84,11 @@ class Hand(Clock):
 
 
 def test_timers_keep_their_rhythm():
-    """A slow callback costs the calls it overlaps, and no burst follows."""
+    """A slow callback omits the calls it overlaps, and no burst follows."""
     clock, calls = Hand(), []
     timer = Timer(lambda: calls.append(clock.shown), 50, clock)
     for clock.shown in range(0, 400, 10):
-        if 60 <= clock.shown < 170:  # the first callback takes so long
+        if 60 <= clock.shown < 170:  # duration of the first callback
             continue
         work = timer.take()
         if work is not None:
@@ -97,7 +97,7 @@ def test_timers_keep_their_rhythm():
 
 
 def test_a_cancelled_timer_rests_until_reset(context):
-    """cancel and reset."""
+    """`cancel` stops a timer and `reset` restarts it."""
     node, calls = Node("a"), []
     timer = node.create_timer(0.01, lambda: calls.append(1))
     timer.cancel()
@@ -108,7 +108,7 @@ def test_a_cancelled_timer_rests_until_reset(context):
 
 
 def test_spin_once_runs_one_callback(context):
-    """Two timers are due; one runs."""
+    """When two timers are due, one runs."""
     node, calls = Node("a"), []
     for name in "ab":
         node.create_timer(0.01, lambda name=name: calls.append(name))
@@ -120,7 +120,7 @@ def test_spin_once_runs_one_callback(context):
 
 
 def test_an_exception_in_a_callback_leaves_spin(context):
-    """It reaches whoever spins."""
+    """The exception reaches the caller of spin."""
     node = Node("a")
     node.create_timer(0.0, lambda: 1 / 0)
     with pytest.raises(ZeroDivisionError):
@@ -142,7 +142,7 @@ def test_only_nodes_that_are_spun_run(context):
 
 
 def test_an_executor_runs_several_nodes(context):
-    """Until it is shut down from a callback."""
+    """They run until the executor is shut down from a callback."""
     executor, seen = SingleThreadedExecutor(), set()
     for name in ("a", "b"):
         node = Node(name)
@@ -153,7 +153,7 @@ def test_an_executor_runs_several_nodes(context):
 
 
 def test_a_clock_on_the_wire_drives_timers(context):
-    """With use_sim_time nothing happens until /clock has advanced by the period, whatever the real time is."""
+    """With use_sim_time a timer waits until /clock has advanced by its period, regardless of real time."""
     node = Node("a", parameter_overrides=[Parameter("use_sim_time", value=True)])
     source, calls = node.create_publisher(ClockMessage, "/clock", 10), []
     node.create_timer(1.0, lambda: calls.append(node.get_clock().now().nanoseconds))
@@ -172,7 +172,7 @@ def test_a_clock_on_the_wire_drives_timers(context):
 
 
 def test_policies_that_do_not_fit_are_told(context, capfd, monkeypatch):
-    """A best-effort publisher gives a reliable subscription nothing, and both ends log it once."""
+    """A best-effort publisher sends nothing to a reliable subscription, and both ends log it once."""
     monkeypatch.setattr("finssim.extensions.ros2.shim.executors.MISMATCH_PERIOD", 0.05)
     node = Node("a")
     node.create_subscription(String, "word", print, 10)
@@ -185,7 +185,7 @@ def test_policies_that_do_not_fit_are_told(context, capfd, monkeypatch):
 
 
 def test_a_volatile_publisher_does_not_serve_a_latched_subscription(context, capfd):
-    """Durability is told too."""
+    """An incompatible durability is logged too."""
     node = Node("a")
     node.create_subscription(
         String, "word", print, QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -203,7 +203,7 @@ def test_a_publisher_takes_its_own_type_only(context):
 
 
 def test_ready_bytes_can_be_published_and_received(context):
-    """For recorders and players."""
+    """Recorders and players use serialised messages."""
     from rclpy.serialization import deserialize_message, serialize_message
 
     node, got = Node("a"), []
@@ -214,7 +214,7 @@ def test_ready_bytes_can_be_published_and_received(context):
 
 
 def test_destroyed_things_are_gone(context):
-    """A destroyed subscription gets nothing, a destroyed node is off the list."""
+    """A destroyed subscription receives nothing, and a destroyed node is no longer listed."""
     node, other, got = Node("a"), Node("b"), []
     subscription = node.create_subscription(String, "word", got.append, 10)
     publisher = node.create_publisher(String, "word", 10)
@@ -229,7 +229,7 @@ def test_destroyed_things_are_gone(context):
 
 
 def test_parameters_are_declared_once_and_before_use(context):
-    """As in rclpy."""
+    """A second declaration and an undeclared use are refused as in rclpy."""
     node = Node("a")
     assert node.declare_parameter("gain", 2.0).value == 2.0
     with pytest.raises(ParameterAlreadyDeclaredException):
@@ -242,7 +242,7 @@ def test_parameters_are_declared_once_and_before_use(context):
 
 
 def test_values_from_outside_keep_the_type(context):
-    """2 is no 2.0: told at the start, as by ROS 2."""
+    """2 is not accepted for 2.0: the error comes at the start, as in ROS 2."""
     node = Node("a", cli_args="--ros-args -p gain:=2 -p name:=x".split())
     assert node.declare_parameter("name", "y").value == "x"
     with pytest.raises(InvalidParameterTypeException, match="gain.*DOUBLE.*such as 1.0"):
@@ -250,7 +250,7 @@ def test_values_from_outside_keep_the_type(context):
 
 
 def test_a_parameter_without_default_must_be_given(context):
-    """Declared by type alone."""
+    """Such a parameter is declared by its type only."""
     given = Node("a", cli_args="--ros-args -p file:=x".split())
     assert given.declare_parameter("file", Parameter.Type.STRING).value == "x"
     missing = Node("b")
@@ -260,7 +260,8 @@ def test_a_parameter_without_default_must_be_given(context):
 
 
 def test_setting_parameters_is_checked(context):
-    """Type, range, read-only and the node's own callback; all or none when set atomically."""
+    """Type, range, read-only and the node's own callback are checked; an atomic set applies all values or
+    none."""
     node = Node("a")
     limits = ParameterDescriptor(floating_point_range=[FloatingPointRange(from_value=0.0, to_value=2.0)])
     node.declare_parameter("gain", 1.0, limits)
@@ -281,7 +282,7 @@ def test_setting_parameters_is_checked(context):
 
 
 def test_names_are_joined_and_renamed(context):
-    """Namespace, private names and rules for one node."""
+    """Names are resolved with namespaces, private names and rules for one node."""
     node = Node("a", namespace="ns", cli_args="--ros-args -r odom:=/z -r __ns:=/other".split())
     assert node.get_fully_qualified_name() == "/other/a"
     assert node.resolve_topic_name("odom") == "/z" and node.resolve_topic_name("~/x") == "/other/a/x"
@@ -289,13 +290,13 @@ def test_names_are_joined_and_renamed(context):
 
 @pytest.mark.parametrize(("name", "namespace"), [("1a", ""), ("a b", ""), ("a", "b c")])
 def test_bad_node_names_are_refused(context, name, namespace):
-    """Before anybody sees them."""
+    """The refusal comes before the name is published."""
     with pytest.raises(NameValidationException, match="letters, digits"):
         Node(name, namespace=namespace)
 
 
 def test_log_lines_look_like_those_of_ros(context, capfd):
-    """Level, time, name; levels, once and throttling hold."""
+    """Lines contain level, time and name; levels, once and throttling work."""
     logger = Node("a", namespace="ns").get_logger()
     logger.debug("hidden")
     for _ in range(3):
@@ -325,7 +326,7 @@ def test_log_lines_look_like_those_of_ros(context, capfd):
     ],
 )
 def test_a_call_that_logs_keeps_its_severity_and_its_conditions(context, calls, sentence):
-    """As rclpy's rcutils_logger has it, word for word; a hidden line counts as well."""
+    """The error has the exact text of rclpy's rcutils_logger; a hidden line counts as well."""
     logger = Node("hidden").get_logger()
     logger.set_level(50)
     with pytest.raises(ValueError) as refused:
@@ -342,7 +343,7 @@ def test_two_calls_on_one_line_are_two(context, capfd):
 
 
 def test_times_add_up():
-    """Arithmetic, comparison and messages."""
+    """Arithmetic, comparison and conversion to messages are exact."""
     time_ = Time(seconds=1, nanoseconds=5) + Duration(seconds=0.5)
     assert time_.seconds_nanoseconds() == (1, 500_000_005)
     assert time_ - Time(seconds=1) == Duration(nanoseconds=500_000_005)
@@ -352,7 +353,7 @@ def test_times_add_up():
 
 
 def test_another_thread_can_publish_and_wake(context):
-    """A message from a thread reaches the one that spins for ever."""
+    """A message from a thread reaches the thread that spins forever."""
     node, got = Node("a"), []
     node.create_subscription(String, "word", got.append, 10)
     publisher = node.create_publisher(String, "word", 10)
@@ -376,13 +377,13 @@ def test_another_thread_can_publish_and_wake(context):
     ],
 )
 def test_what_is_missing_says_what_it_needs(module):
-    """One sentence instead of a riddle."""
+    """The error is one clear sentence."""
     with pytest.raises(ImportError, match="needs a sourced ROS 2"):
         __import__(module)
 
 
 def test_several_threads_of_callbacks_need_ros():
-    """The name exists in rclpy, so the refusal names it."""
+    """The name exists in rclpy, so the refusal contains it."""
     with pytest.raises(ImportError, match="use SingleThreadedExecutor"):
         from rclpy.executors import MultiThreadedExecutor  # noqa: F401
 
@@ -400,7 +401,7 @@ LACKING = [
 
 
 def test_what_a_class_lacks_says_what_to_do(context):
-    """A sentence where rclpy has more; `getattr` with a default still gives the default."""
+    """The error is a sentence for attributes of rclpy; `getattr` with a default still returns the default."""
     node = Node("a")
     for made, name, hint in LACKING:
         thing = made(node)
@@ -410,10 +411,10 @@ def test_what_a_class_lacks_says_what_to_do(context):
 
 
 def test_a_misspelt_name_is_none_of_rclpy(context):
-    """The ordinary words of Python."""
+    """The error is Python's usual message."""
 
     class Mine(Node):
-        """A node of one's own."""
+        """Custom node."""
 
     with pytest.raises(AttributeError, match="'Mine' object has no attribute 'create_publishr'"):
         Mine("a").create_publishr  # noqa: B018
@@ -430,19 +431,19 @@ def test_a_misspelt_name_is_none_of_rclpy(context):
     ],
 )
 def test_what_a_module_lacks_says_what_to_do(module, name, hint):
-    """With `from module import name`."""
+    """The hint appears with `from module import name`."""
     with pytest.raises(ImportError, match=f"{name} needs a sourced ROS 2: .*{hint}"):
         exec(f"from {module} import {name}")
 
 
 def test_parts_of_rclpy_come_with_it():
-    """As in the real one: `import rclpy` alone."""
+    """`import rclpy` alone provides its submodules, as in the real one."""
     assert rclpy.duration.Duration is Duration and rclpy.qos.QoSProfile is QoSProfile
     assert rclpy.time.Time is Time and rclpy.utilities.remove_ros_args(["a"]) == ["a"]
 
 
 def test_every_name_that_is_refused_is_one_the_class_lacks():
-    """A list that is kept by hand."""
+    """The list is maintained by hand."""
     import tf2_ros  # noqa: F401 - its classes are among them
 
     from finssim.extensions.ros2.limits import MISSING, Limited
@@ -458,7 +459,7 @@ def _below(kind):
 
 
 def test_coroutines_need_ros(context):
-    """They would silently never run."""
+    """Coroutines would silently never run."""
 
     async def callback(message):
         raise AssertionError
@@ -467,14 +468,14 @@ def test_coroutines_need_ros(context):
         Node("a").create_subscription(String, "word", callback, 10)
 
 
-# --- the choice between the real rclpy and ours -----------------------------------------------------------------------
+# --- choice between the real rclpy and the built-in one ---------------------------------------------------------------
 
 ACTIVATE = "from finssim.extensions.ros2.backend import activate; "
 SCRIPT = ACTIVATE + "b = activate(); import rclpy; print(b.name, rclpy.__name__)"
 
 
 def chosen(tmp_path, text, **environ):
-    """What a fresh process chooses where a package `rclpy` with this text can be found."""
+    """Return the choice of a fresh process that finds a package `rclpy` with this text."""
     if text is not None:
         package = tmp_path / "rclpy"
         package.mkdir()
@@ -487,14 +488,14 @@ def chosen(tmp_path, text, **environ):
 
 @pytest.mark.slow
 def test_a_real_rclpy_is_never_shadowed(tmp_path):
-    """If it can be imported it is used."""
+    """A real rclpy that can be imported is used."""
     run = chosen(tmp_path, "")
     assert run.stdout.split() == ["native", "rclpy"] and "it can be imported" in run.stderr
 
 
 @pytest.mark.slow
 def test_a_half_sourced_ros_is_found_out_by_importing(tmp_path):
-    """rclpy is there, what it needs is not: ours is used, and the reason told."""
+    """rclpy exists but its dependency does not: the built-in one is used, and the reason is reported."""
     run = chosen(tmp_path, "import a_module_that_ros_needs\n")
     assert (
         run.stdout.split() == ["dds", "finssim.extensions.ros2.shim"]
@@ -504,21 +505,21 @@ def test_a_half_sourced_ros_is_found_out_by_importing(tmp_path):
 
 @pytest.mark.slow
 def test_ours_can_be_asked_for(tmp_path):
-    """PLATFORM_ROS=dds, even beside a real one."""
+    """PLATFORM_ROS=dds selects the built-in rclpy even beside a real one."""
     run = chosen(tmp_path, "", PLATFORM_ROS="dds", ROS_DOMAIN_ID="7")
     assert run.stdout.split()[0] == "dds" and "domain 7, sends on the loopback alone" in run.stderr
 
 
 @pytest.mark.slow
 def test_the_real_one_can_be_insisted_on(tmp_path):
-    """PLATFORM_ROS=native without one is an error, not a surprise."""
+    """PLATFORM_ROS=native without a real rclpy is an error."""
     run = chosen(tmp_path, None, PLATFORM_ROS="native")
     assert run.returncode and "source a ROS 2 first" in run.stderr
 
 
 @pytest.mark.slow
 def test_without_cyclone_the_sentence_says_what_to_install():
-    """A machine with neither ROS 2 nor Cyclone's wheel."""
+    """The machine has neither ROS 2 nor Cyclone's wheel."""
     script = "import sys; sys.modules['cyclonedds'] = None; " + ACTIVATE + "activate()"
     run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert run.returncode and "source a ROS 2, or install finssim[ros2]" in run.stderr

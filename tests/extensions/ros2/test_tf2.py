@@ -1,5 +1,5 @@
 # ruff: noqa: E402 - rclpy can be imported once a backend is active
-"""Transforms over time: chains, interpolation and refusals as in tf2, and the way over /tf and /tf_static."""
+"""Transforms over time: chains, interpolation and refusals as in tf2, and transport over /tf and /tf_static."""
 
 import math
 import time
@@ -31,7 +31,7 @@ from finssim.core.rotations import quat_from_euler, quat_rotate
 
 
 def moved(parent, child, seconds, place=(0.0, 0.0, 0.0), turn=(0.0, 0.0, 0.0)):
-    """A TransformStamped with roll, pitch and yaw."""
+    """Return a TransformStamped with roll, pitch and yaw."""
     made = TransformStamped(child_frame_id=child)
     made.header.frame_id, made.header.stamp = parent, Time(seconds=seconds).to_msg()
     t, r = made.transform.translation, made.transform.rotation
@@ -52,7 +52,7 @@ def turn_of(found):
 
 @pytest.fixture
 def tree():
-    """map → odom → base_link, which turns and goes, with a camera on it, and another vehicle below the map."""
+    """map → odom → base_link, which turns and moves, with a camera on it, and another vehicle below the map."""
     buffer = Buffer()
     for t in (1.0, 2.0, 3.0):
         buffer.set_transform(moved("map", "odom", t, (0.5, 0.0, 0.0)), "test")
@@ -65,7 +65,7 @@ def tree():
 
 
 def test_a_chain_is_multiplied_up_and_down(tree):
-    """Against the closed form: at 2 s the vehicle looks backwards, and its camera is behind its middle."""
+    """By the closed form, at 2 s the vehicle looks backwards and its camera is behind its middle."""
     found = tree.lookup_transform("map", "camera", Time(seconds=2.0))
     assert place_of(found) == pytest.approx([0.5 + 2.0 - 0.2, 0.0, -0.9])
     assert abs(turn_of(found) @ quat_from_euler(0.0, 0.0, math.pi)) == pytest.approx(1.0)
@@ -78,7 +78,7 @@ def test_a_chain_is_multiplied_up_and_down(tree):
 
 
 def test_between_two_samples_the_place_is_linear_and_the_turn_the_shortest(tree):
-    """A quarter of a turn in a second: an eighth in half a second."""
+    """A quarter turn in a second is an eighth in half a second."""
     found = tree.lookup_transform("odom", "base_link", TimeMessage(sec=1, nanosec=250_000_000))
     assert place_of(found) == pytest.approx([1.25, 0.0, -1.0])
     wanted = np.asarray(quat_from_euler(0.0, 0.0, 0.5 * math.pi * 1.25))
@@ -90,7 +90,7 @@ def test_between_two_samples_the_place_is_linear_and_the_turn_the_shortest(tree)
 
 
 def test_time_zero_is_the_latest_that_the_whole_chain_knows(tree):
-    """Links that are not on the chain do not count, static ones hold at any time."""
+    """Links outside the chain are ignored; static ones are valid at any time."""
     assert tree.lookup_transform("map", "camera", Time()).header.stamp == TimeMessage(sec=3)
     with pytest.raises(ExtrapolationException):
         tree.lookup_transform("other", "camera", Time(seconds=3.0))
@@ -100,7 +100,7 @@ def test_time_zero_is_the_latest_that_the_whole_chain_knows(tree):
 
 
 def test_two_times_meet_in_a_frame_that_stands_still(tree):
-    """Where the camera was at 1 s as seen from the vehicle at 3 s."""
+    """The vehicle's position at 1 s is found in its own frame at 3 s."""
     found = tree.lookup_transform_full(
         "base_link", Time(seconds=3.0), "base_link", Time(seconds=1.0), "map", Duration()
     )
@@ -128,7 +128,7 @@ def test_two_times_meet_in_a_frame_that_stands_still(tree):
     ],
 )
 def test_what_is_not_known_is_refused_as_tf2_does(tree, target, source, seconds, error, words):
-    """All are a TransformException; `can_transform` gives the reason."""
+    """All errors are a TransformException; `can_transform` returns the reason."""
     tree.set_transform(moved("sea", "island", 2.0), "test")
     with pytest.raises(error, match=words) as refused:
         tree.lookup_transform(target, source, Time(seconds=seconds))
@@ -139,7 +139,7 @@ def test_what_is_not_known_is_refused_as_tf2_does(tree, target, source, seconds,
 
 
 def test_malformed_transforms_are_left_out(tree):
-    """NaN, no rotation, a frame in itself."""
+    """NaN, an invalid rotation and a frame that is its own parent are ignored."""
     bad = [moved("map", "x", 1.0, (math.nan, 0.0, 0.0)), moved("x", "x", 1.0), moved("map", "x", 1.0)]
     bad[-1].transform.rotation.w = 0.5
     for transform in bad:
@@ -152,7 +152,7 @@ def test_malformed_transforms_are_left_out(tree):
 
 
 def test_old_poses_are_forgotten():
-    """After the time of the cache; what comes too late is left out, what comes in another order is not."""
+    """Poses older than the cache time are dropped, late ones too; poses out of order are kept."""
     buffer = Buffer(Duration(seconds=2.0))
     for t in (1.0, 4.0, 3.0, 5.0, 0.5):
         buffer.set_transform(moved("map", "base_link", t, (t, 0.0, 0.0)), "test")
@@ -196,7 +196,7 @@ def test_broadcasters_reach_a_listener_that_comes_later(nodes):
 
 
 def test_a_lookup_waits_no_longer_than_asked(tree):
-    """And not at all for what is there."""
+    """An available transform is returned at once."""
     began = time.monotonic()
     assert tree.can_transform("map", "camera", Time(), Duration(seconds=60.0))
     assert time.monotonic() - began < 30.0

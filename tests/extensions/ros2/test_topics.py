@@ -11,7 +11,7 @@ PAGE = (Path(__file__).resolve().parents[3] / "docs" / "reference" / "ros2_topic
 
 
 def row(*cells):
-    """A line of a table on the page."""
+    """Return a row of a table on the page."""
     return "| " + " | ".join(cells) + " |"
 
 
@@ -20,7 +20,8 @@ ALL = [*TOPICS.values(), *(topic for topics in OWN_TOPICS.values() for topic in 
 
 @pytest.mark.parametrize("topic", ALL, ids=lambda topic: topic.name)
 def test_each_topic_is_known_and_on_the_page(topic):
-    """Its type exists for Humble and Jazzy, its quality and frame are explained, and the page has its line."""
+    """Its type exists for Humble and Jazzy, its quality and frame are explained, and the page contains its
+    row."""
     for distro in ("humble", "jazzy"):
         assert codec_of(distro).message(topic.type)
     assert topic.quality in QUALITIES and (not topic.frame or topic.frame in FRAMES)
@@ -29,7 +30,7 @@ def test_each_topic_is_known_and_on_the_page(topic):
 
 
 def test_services_qualities_and_frames_are_on_the_page():
-    """The other tables."""
+    """The other tables of the page are complete."""
     lines = [row(f"`{s.name}`", s.type, s.server, s.meaning) for s in SERVICES.values()]
     lines += [row(*pair) for pair in QUALITIES.items()] + [
         row(f"`{name}`", text) for name, text in FRAMES.items()
@@ -38,12 +39,12 @@ def test_services_qualities_and_frames_are_on_the_page():
 
 
 def test_topics_stand_below_the_vehicle():
-    """Those with a slash for themselves."""
+    """Topics with a leading slash are absolute."""
     assert TOPICS["odometry"].under("rov") == "/rov/odom" and TOPICS["clock"].under("rov") == "/clock"
 
 
 def test_each_quality_has_its_profile():
-    """As the page words them."""
+    """Profiles agree with the text of the page."""
     from finssim.extensions.ros2.backend import activate
     from finssim.extensions.ros2.topics import quality_profile
 

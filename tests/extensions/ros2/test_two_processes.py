@@ -1,5 +1,5 @@
 # ruff: noqa: E402 - rclpy can be imported once a backend is active
-"""Two processes on the loopback: what one says, the other hears."""
+"""Two processes on the loopback receive each other's messages."""
 
 import os
 import subprocess
@@ -29,17 +29,17 @@ pytestmark = pytest.mark.slow
 
 PEER = Path(__file__).with_name("peer.py")
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-PATIENCE = 10.0  # [s] on a busy machine; nothing here takes a tenth of it
+PATIENCE = 10.0  # [s] on a busy machine; every wait here needs less than a tenth of it
 
 
 def start(*arguments, **environ):
-    """A peer process."""
+    """Start a peer process."""
     command = [sys.executable, str(PEER), *arguments]
     return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env={**os.environ, **environ})
 
 
 def finish(process):
-    """End a peer as a service manager would; its status and what it wrote."""
+    """End a peer like a service manager; return its status and output."""
     process.terminate()
     _, text = process.communicate(timeout=PATIENCE)
     return process.returncode, text
@@ -47,7 +47,7 @@ def finish(process):
 
 @pytest.fixture(scope="module")
 def node():
-    """Our node."""
+    """Node of this process."""
     rclpy.init(args=[])
     yield Node("tester", namespace="peer")
     rclpy.shutdown()
@@ -55,7 +55,7 @@ def node():
 
 @pytest.fixture(scope="module")
 def echo(node):
-    """The peer that sends everything back."""
+    """Peer that returns every message."""
     process = start("echo")
     yield process
     process.kill()
@@ -63,7 +63,7 @@ def echo(node):
 
 
 def until(node, condition, each=lambda: None):
-    """Spin until a condition holds; whether it does in time."""
+    """Spin until a condition is true; return whether it became true in time."""
     end = time.monotonic() + PATIENCE
     while not condition() and time.monotonic() < end:
         each()
@@ -72,7 +72,7 @@ def until(node, condition, each=lambda: None):
 
 
 def odometry():
-    """A message with numbers to recognise."""
+    """Return a message with recognisable numbers."""
     message = Odometry(child_frame_id="base_link")
     message.pose.pose.position.z = -0.75
     message.pose.covariance[35] = 0.25
@@ -80,7 +80,7 @@ def odometry():
 
 
 def image():
-    """A picture of a megabyte."""
+    """Return a picture of a megabyte."""
     return Image(height=1000, width=1000, data=np.arange(10**6).astype(np.uint8).tobytes())
 
 
@@ -93,7 +93,7 @@ def image():
     ],
 )
 def test_messages_come_back_as_they_were_sent(node, echo, kind, topic, qos, made):
-    """Reliable, best effort and our own type, there and back."""
+    """Reliable messages, best-effort ones and FinsSim's own type return unchanged."""
     got = []
     subscription = node.create_subscription(kind, f"{topic}_back", got.append, qos)
     publisher = node.create_publisher(kind, topic, qos)
@@ -103,7 +103,7 @@ def test_messages_come_back_as_they_were_sent(node, echo, kind, topic, qos, made
 
 
 def test_who_comes_late_still_gets_what_was_latched(node, echo):
-    """Published at the peer's start, once."""
+    """The message was published once, at the peer's start."""
     got = []
     subscription = node.create_subscription(PoseStamped, "goal", got.append, LATCHED)
     assert until(node, lambda: bool(got)) and got[0].pose.position.x == 1.5
@@ -111,7 +111,7 @@ def test_who_comes_late_still_gets_what_was_latched(node, echo):
 
 
 def test_a_service_answers(node, echo):
-    """Several calls, each with its own answer."""
+    """Several calls each receive their own answer."""
     client = node.create_client(SetBool, "set_armed")
     assert client.wait_for_service(PATIENCE)
     futures = [client.call_async(SetBool.Request(data=value)) for value in (True, False)]
@@ -122,7 +122,7 @@ def test_a_service_answers(node, echo):
 
 
 def test_the_node_list_shows_the_other_process(node, echo):
-    """With names, namespaces, topics and types."""
+    """The list has names, namespaces, topics and types."""
     assert until(node, lambda: ("echo", "/peer") in node.get_node_names_and_namespaces())
     assert ("tester", "/peer") in node.get_node_names_and_namespaces()
     topics = dict(node.get_topic_names_and_types())
@@ -131,7 +131,8 @@ def test_the_node_list_shows_the_other_process(node, echo):
 
 
 def test_every_endpoint_of_the_other_process_tells_its_hash(node, echo):
-    """The node list too: without it each `ros2` command warns. Services tell which ends belong together instead."""
+    """The node list has one too: without it each `ros2` command warns. Services instead announce which ends
+    match."""
     participant = rclpy.get_default_context().participant
     told = {"rt": b"typehash=RIHS01_", "ro": b"typehash=RIHS01_", "rq": b"id=", "rr": b"id="}
     for topic in (BuiltinTopicDcpsPublication, BuiltinTopicDcpsSubscription):
@@ -143,7 +144,7 @@ def test_every_endpoint_of_the_other_process_tells_its_hash(node, echo):
 
 
 def test_a_parameter_file_and_a_new_name_reach_the_other_process(node, tmp_path):
-    """--params-file, -p, -r of a topic and of the node itself."""
+    """Cases are --params-file, -p, and -r for a topic and for the node itself."""
     path = tmp_path / "p.yaml"
     path.write_text("/**/renamed:\n  ros__parameters: {gain: 2.5, names: [a]}\n")
     words = f"--params-file {path} -p names:=[b,c] -r settings:=/other -r __node:=renamed".split()
@@ -157,7 +158,7 @@ def test_a_parameter_file_and_a_new_name_reach_the_other_process(node, tmp_path)
 
 
 def test_data_flows_between_releases(node):
-    """A peer that speaks Humble is heard; only the node list of the other release cannot be read."""
+    """Messages of a Humble peer are received; only the node list of the other release cannot be read."""
     process, got = start("settings", "--ros-args", "-r", "settings:=/humble", ROS_DISTRO="humble"), []
     subscription = node.create_subscription(ThrusterCommand, "/humble", got.append, LATCHED)
     assert until(node, lambda: bool(got)) and got[0].source == "/peer/settings"
@@ -168,7 +169,7 @@ def test_data_flows_between_releases(node):
 
 
 def test_a_killed_peer_does_not_hold_up_the_others(node):
-    """kill -9 in mid-talk: a reliable publisher goes on, each call bounded."""
+    """After kill -9 during transmission, a reliable publisher continues, and each call is bounded."""
     process, got = start("echo"), []
     subscription = node.create_subscription(Odometry, "odom_back", got.append, 10)
     publisher = node.create_publisher(Odometry, "odom", 10)
@@ -181,5 +182,5 @@ def test_a_killed_peer_does_not_hold_up_the_others(node):
         publisher.publish(odometry())
         rclpy.spin_once(node, timeout_sec=0.0)
         longest = max(longest, time.monotonic() - began)
-    assert longest < PATIENCE / 4  # a writer that waits for ever would not be here
+    assert longest < PATIENCE / 4  # a writer that waits forever would never reach this line
     node.destroy_publisher(publisher), node.destroy_subscription(subscription)

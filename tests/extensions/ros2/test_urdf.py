@@ -1,4 +1,4 @@
-"""The vehicle as URDF is the vehicle of the file, and a tree that readers of URDF take."""
+"""The URDF describes the vehicle of the file, as a tree that URDF readers accept."""
 
 from xml.etree import ElementTree
 
@@ -18,7 +18,7 @@ def numbers(element, name):
 
 @pytest.mark.parametrize("name", catalogue())
 def test_every_vehicle_is_a_tree_of_fixed_joints(name):
-    """One root, every joint between links that exist, poses as the file has them."""
+    """There is one root, every joint connects existing links, and poses are those of the file."""
     vehicle = load_vehicle(name)
     robot = ElementTree.fromstring(urdf_of(vehicle))
     links = [link.get("name") for link in robot.findall("link")]
@@ -42,7 +42,7 @@ def test_every_vehicle_is_a_tree_of_fixed_joints(name):
 
 
 def test_fins_turn_about_their_span():
-    """A revolute joint of the fin's name, with its travel; the angle is the deflection."""
+    """Each fin has a revolute joint of its name and range; the angle is the deflection."""
     vehicle = torpedo()
     robot = ElementTree.fromstring(urdf_of(vehicle))
     joint = robot.find("joint[@name='elevator']")
@@ -58,7 +58,7 @@ def test_fins_turn_about_their_span():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["finsrov", "bluerov2_heavy"])
 def test_mujoco_reads_the_same_body(name):
-    """Mass, centre of gravity and principal inertia, by a reader of URDF that is not ours."""
+    """MuJoCo's URDF reader gives the same mass, centre of gravity and principal inertia."""
     mujoco = pytest.importorskip("mujoco")
     vehicle = load_vehicle(name)
     robot = ElementTree.fromstring(urdf_of(vehicle))

@@ -1,4 +1,4 @@
-"""The wire stays on this machine until somebody says otherwise."""
+"""Communication stays on this machine unless configured otherwise."""
 
 import pytest
 
@@ -7,7 +7,7 @@ from finssim.extensions.ros2.wire import LOOPBACK, wire_settings
 
 
 def test_without_a_word_it_is_the_loopback():
-    """Nothing set: domain 0, this machine only, Jazzy."""
+    """Defaults are domain 0, this machine only, Jazzy."""
     settings = wire_settings({})
     assert (settings.domain, settings.xml, settings.distro.name) == (0, LOOPBACK, "jazzy")
     assert "name='lo'" in LOOPBACK and "127.0.0.1" in LOOPBACK
@@ -28,7 +28,7 @@ def test_the_domain_alone_does_not_open_the_network():
     ],
 )
 def test_who_asks_for_the_network_gets_it(environ):
-    """Then Cyclone's own configuration rules."""
+    """Cyclone's own configuration then applies."""
     assert wire_settings(environ).xml is None
 
 
@@ -36,7 +36,7 @@ def test_who_asks_for_the_network_gets_it(environ):
     "environ", [{"ROS_LOCALHOST_ONLY": "1"}, {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}]
 )
 def test_who_asks_for_this_machine_gets_it(environ):
-    """The other way round."""
+    """Each setting restricts communication to this machine."""
     assert wire_settings(environ).xml == LOOPBACK
 
 
@@ -51,13 +51,13 @@ def test_who_asks_for_this_machine_gets_it(environ):
     ],
 )
 def test_nonsense_is_refused(environ):
-    """Each variable names itself in the sentence."""
+    """The message names the variable."""
     with pytest.raises(Ros2Error, match=next(iter(environ))):
         wire_settings(environ)
 
 
 def test_releases_differ_as_they_do():
-    """Humble: long identifiers and no hashes."""
+    """Humble has long identifiers and no hashes."""
     humble, jazzy = (wire_settings({"ROS_DISTRO": d}).distro for d in ("humble", "jazzy"))
     assert (humble.gid_length, humble.type_hashes, jazzy.gid_length, jazzy.type_hashes) == (
         24,

@@ -55,14 +55,15 @@ print("whole")
 
 @pytest.fixture
 def participant():
-    """One presence on the wire."""
+    """One participant on the wire."""
     joined = Participant(wire_settings())
     yield joined
     joined.close()
 
 
 def test_a_type_is_translated_where_no_other_thread_changes_the_types(participant, monkeypatch):
-    """Cyclone 11.0.1 reads the types of a domain without a lock then: the one that peers share would crash it."""
+    """Cyclone 11.0.1 then reads the types of a domain without a lock: in the domain shared with peers it
+    would crash."""
     used, create = [], binding.ddspy_topic_create
     monkeypatch.setattr(
         binding, "ddspy_topic_create", lambda *given: (used.append(given[0]), create(*given))[1]
@@ -76,7 +77,7 @@ def test_a_type_is_translated_where_no_other_thread_changes_the_types(participan
 
 @pytest.mark.slow
 def test_participants_come_and_go_with_their_types_and_while_a_thread_talks():
-    """In a process of its own, whose freed memory is overwritten.
+    """The test runs in its own process, with overwritten freed memory.
 
     Without the domain for translating, 3 of 6 runs of 400 such rounds ended in SIGSEGV.
     """
@@ -91,14 +92,14 @@ def test_participants_come_and_go_with_their_types_and_while_a_thread_talks():
 
 
 def test_bytes_that_are_no_message_of_the_type_are_refused(participant):
-    """A string that claims to be longer than its sample."""
+    """A string with a length beyond its sample is refused."""
     writer = participant.writer("rt/word", "std_msgs/msg/String", Quality(transient_local=True))
     with pytest.raises(DDSException, match="rt/word"):
         writer.write(bytearray(b"\0\1\0\0\xff\0\0\0word"))
 
 
 def test_who_still_writes_and_reads_after_the_end_is_refused(participant):
-    """A thread may be late: it gets an error or nothing, and the process lives on."""
+    """A late thread gets an error or nothing, and the process survives."""
     quality = Quality(transient_local=True)
     writer = participant.writer("rt/word", "std_msgs/msg/String", quality)
     reader = participant.reader("rt/word", "std_msgs/msg/String", quality)
@@ -112,7 +113,7 @@ def test_who_still_writes_and_reads_after_the_end_is_refused(participant):
 
 
 def test_a_peer_that_comes_while_the_peers_are_counted_is_counted(participant, monkeypatch):
-    """As nodes start at once on a busy machine: a node that asked for its graph then ended in IndexError."""
+    """When nodes started together on a busy machine, a node that queried its graph ended in an IndexError."""
     name, quality, late, matched = "std_msgs/msg/String", Quality(), [], wire._matched_writers
     first = participant.writer("rt/word", name, quality)
     reader = participant.reader("rt/word", name, quality)

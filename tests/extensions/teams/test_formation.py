@@ -1,4 +1,5 @@
-"""Formation keeping: the net's geometry, when it holds, tears and delivers, what is seen, the consensus baseline."""
+"""Formation keeping: geometry of the net, holding, tearing, delivery, observations, and the consensus
+baseline."""
 
 import math
 from dataclasses import replace
@@ -17,7 +18,7 @@ from finssim.tasks.communication import Communication
 from finssim.vehicles import load_vehicle
 
 QUIET = Formation(drift=0.0)
-"""The target stays where it is until somebody takes it along."""
+"""Task in which the target does not move until it is held."""
 
 
 def environment(task, worlds=4, **options):
@@ -29,19 +30,19 @@ def still(env):
 
 
 def triangle(side, height=-3.0):
-    """Corners of an equal triangle around the z axis, (3, 3)."""
+    """Return the corners of an equilateral triangle around the z axis, (3, 3)."""
     angles = 2.0 * math.pi / 3.0 * np.arange(3)
     level = side / math.sqrt(3.0)
     return np.column_stack([level * np.cos(angles), level * np.sin(angles), np.full(3, height)])
 
 
 def total(env, name):
-    """What is counted under that name in the episodes that run."""
+    """Return the sum of a count in the current episodes."""
     return env.arrays.totals.numpy()[:, env.task.totals.index(name)].copy()
 
 
 def place(env, corners, target, goal):
-    """Vehicles at rest on the corners, a target and a goal, in every world."""
+    """Place vehicles at rest on the corners, a target and a goal in every world."""
     env.simulator.state.position.assign(np.float32(np.broadcast_to(corners, (env.worlds, 3, 3))))
     env.simulator.state.velocity.zero_()
     for array, x in ((env.arrays.net.target, target), (env.arrays.goal_position, goal)):
@@ -49,7 +50,8 @@ def place(env, corners, target, goal):
 
 
 def test_distance_to_the_triangle_is_the_least_over_its_points():
-    """Against SciPy's minimiser over two coordinates within the triangle, for points before every corner and edge."""
+    """The distance equals SciPy's minimum over two coordinates within the triangle, for points at every
+    corner and edge."""
     rng = np.random.default_rng(1)
     for _ in range(40):
         a, b, c, x = rng.uniform(-1.0, 1.0, (4, 3))
@@ -69,7 +71,7 @@ def test_edges_are_sorted():
 
 
 def test_the_observation():
-    """Of every agent, against SciPy, on the way."""
+    """The observation of every agent equals one computed with SciPy, during motion."""
     env = environment(Formation())
     rng = np.random.default_rng(0)
     for _ in range(8):
@@ -104,7 +106,7 @@ def test_the_observation():
     ],
 )
 def test_the_net_holds_what_is_near_while_it_is_neither_torn_nor_slack(side, height, held):
-    """0.10 m; 1.215 x 1.2 m = 1.458 m; 0.5 x 1.2 m = 0.6 m."""
+    """Limits are 0.10 m; 1.215 x 1.2 m = 1.458 m; 0.5 x 1.2 m = 0.6 m."""
     env = environment(replace(QUIET, collision=0.0))
     place(env, triangle(side), (0.0, 0.0, -3.0 + height), (3.0, 0.0, -3.0))
     still(env)
@@ -112,7 +114,7 @@ def test_the_net_holds_what_is_near_while_it_is_neither_torn_nor_slack(side, hei
 
 
 def test_what_is_held_goes_along_and_what_is_not_drifts():
-    """All three push along world x for two seconds: a held target has moved with their middle, another by its drift."""
+    """All push along world x for two seconds: a held target moves with their middle, another by its drift."""
     moved = {}
     for height in (0.0, 1.0):
         env = environment(Formation())
@@ -131,7 +133,7 @@ def test_what_is_held_goes_along_and_what_is_not_drifts():
 
 
 def test_success_is_one_second_in_the_goal():
-    """Held 0.29 m from the goal: after 10 steps and not after 9; 0.31 m away: never."""
+    """Held 0.29 m from the goal, success comes after 10 steps and not after 9; at 0.31 m it never comes."""
     for away, expected in ((0.29, [False] * 9 + [True]), (0.33, [False] * 10)):
         env = environment(QUIET)
         place(env, triangle(1.2), (0.0, 0.0, -3.0), (away, 0.0, -3.0))
@@ -141,7 +143,7 @@ def test_success_is_one_second_in_the_goal():
 
 
 def test_a_net_stretched_for_longer_than_the_grace_tears():
-    """Eleven steps beyond the longest edge: the grace is one second, and the edge must be longer than that."""
+    """It tears after eleven steps beyond the longest edge: the grace is one second and must be exceeded."""
     env = environment(QUIET)
     place(env, triangle(1.6), (0.0, 3.0, -3.0), (3.0, 0.0, -3.0))
     ended = [still(env).terminated.all() for _ in range(11)]
@@ -151,7 +153,7 @@ def test_a_net_stretched_for_longer_than_the_grace_tears():
 
 
 def test_progress_adds_up_to_the_way():
-    """Of the net to the target and of the target to the goal, each with its weight."""
+    """Progress sums to the distances of net to target and of target to goal, each with its weight."""
     weights = dict.fromkeys(("shape", "step", "bump", "action", "change"), 0.0)
     env = environment(Formation(reward=replace(QUIET.reward, net=2.0, goal=3.0, **weights)), worlds=8)
     before, paid = (total(env, "to_net"), total(env, "to_goal")), np.zeros(8)
@@ -163,7 +165,7 @@ def test_progress_adds_up_to_the_way():
 
 
 def rate(task, who, vehicle="finsrov", worlds=32):
-    """Share of worlds in which the target is delivered, and of those in which the net tears."""
+    """Return the share of worlds in which the target is delivered, and of those in which the net tears."""
     env, team = environment(task, worlds=worlds, vehicle=vehicle), baseline("formation", "consensus", vehicle)
     observation = env.arrays.observation.numpy().reshape(worlds, 3, 34)
     done, success, torn = np.zeros((3, worlds), dtype=bool)
@@ -193,7 +195,8 @@ def test_the_consensus_delivers_on_messages():
 
 
 def test_the_net_is_longer_for_longer_vehicles():
-    """2.1 times the longest: RexROV has 2.6 m; FinsROV's 0.56 m ask for less than the 1.2 m of the task."""
+    """It is 2.1 times the longest vehicle: 2.6 m for RexROV; FinsROV's 0.56 m need less than the task's 1.2
+    m."""
     rexrov, finsrov = load_vehicle("rexrov"), load_vehicle("finsrov")
     assert Formation().fitted([finsrov, rexrov, finsrov]).side == pytest.approx(2.1 * 2.6)
     assert Formation().fitted([finsrov] * 3).side == 1.2

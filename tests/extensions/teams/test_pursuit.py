@@ -1,4 +1,4 @@
-"""1-v-1 pursuit: what is seen, how fast the prey is and where it goes, what counts as captured."""
+"""1-v-1 pursuit: observations, speed and course of the prey, and capture."""
 
 import math
 from dataclasses import replace
@@ -26,7 +26,7 @@ def hunted(mode, **changes):
 
 
 def place(env, pursuer, prey):
-    """Both vehicles somewhere, level, at rest, in every world."""
+    """Place both vehicles, level and at rest, in every world."""
     x = np.zeros((env.worlds, 2, 3), dtype=np.float32)
     x[:, 0], x[:, 1] = pursuer, prey
     env.simulator.state.position.assign(x)
@@ -40,7 +40,7 @@ def world_velocity(env, v):
 
 
 def test_the_observation():
-    """Against SciPy, on the way."""
+    """The observation equals one computed with SciPy, during motion."""
     env = environment(Pursuit())
     rng = np.random.default_rng(0)
     for _ in range(30):
@@ -58,9 +58,9 @@ def test_the_observation():
 
 @pytest.mark.parametrize("name", ["finsrov", "bluerov2_heavy"])
 def test_the_preys_speed_is_a_part_of_what_the_pursuer_can_do(name):
-    """Steady speed under full surge from d1 v + d2 v² = tau, or where the Munk moment takes over, if that is slower.
+    """The pursuer's speed solves d1 v + d2 v² = tau at full surge, or is lower where the Munk moment dominates.
 
-    FinsROV is held by its thrust, BlueROV2 Heavy by its stiffness. A straight prey settles at its part of it.
+    FinsROV is limited by its thrust, BlueROV2 Heavy by its stiffness. A straight prey settles at its share of it.
     """
     vehicle = load_vehicle(name)
     hydro = vehicle.hydrodynamics["calibrated"]
@@ -81,14 +81,15 @@ def test_the_preys_speed_is_a_part_of_what_the_pursuer_can_do(name):
 
 
 def test_a_prey_is_no_faster_than_its_own_thrusters():
-    """A slow prey before a fast pursuer keeps within nine tenths of the speed that it can hold."""
+    """A slow prey before a fast pursuer stays within nine tenths of its sustainable speed."""
     fast, slow = load_vehicle("finsrov"), load_vehicle("bluerov2_heavy")
     speed = Pursuit(prey_speed=1.0).fitted([fast, slow]).speed
     assert speed == pytest.approx(0.9 * DriveNumbers.of(slow).top)
 
 
 def test_at_the_speed_it_can_hold_a_vehicle_stays_level():
-    """BlueROV2 at nine tenths of `level_speed` stays within 30° of level; at full thrust, for 2.5 m/s, it tips over."""
+    """BlueROV2 at nine tenths of `level_speed` stays within 30° of level; at full thrust, for 2.5 m/s, it
+    tips over."""
     env = environment(hunted("straight", prey_speed=1.0), vehicle="bluerov2")
     assert env.task.speed < 0.5
     tilt = np.zeros(2)
@@ -108,7 +109,8 @@ def test_at_the_speed_it_can_hold_a_vehicle_stays_level():
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", PREY_MODES)
 def test_every_prey_stays_in_its_range_and_below_its_speed(mode):
-    """Chased by lead pursuit for two minutes: 20 % more while it turns, half a metre at the border."""
+    """Chased by lead pursuit for two minutes, it stays within 20 % while it turns and half a metre at the
+    border."""
     env = environment(hunted(mode, hold=1e9, time_limit=1e9), worlds=16)
     chaser = baseline("pursuit", "lead")
     observation, fastest = env.arrays.observation.numpy(), 0.0
@@ -122,7 +124,8 @@ def test_every_prey_stays_in_its_range_and_below_its_speed(mode):
 
 
 def courses(mode, gap=2.0, steps=100):
-    """Level course of the prey in each world after some time, and the direction away from a pursuer that lies still."""
+    """Return the prey's level course in each world after some time, and the direction away from a resting
+    pursuer."""
     env = environment(hunted(mode), worlds=32)
     place(env, (0.0, 0.0, -3.0), (gap, 0.0, -3.0))
     for _ in range(steps):
@@ -144,7 +147,7 @@ def test_a_hybrid_prey_flees_from_who_is_near_and_wanders_otherwise():
 
 
 def test_a_straight_prey_keeps_its_course_and_a_random_one_does_not():
-    """Turn of the course from 5 s to 13 s, with the pursuer out of the way; a random prey draws every 4 s."""
+    """The course change is taken from 5 s to 13 s with a distant pursuer; a random prey redraws every 4 s."""
     turns = {}
     for mode in ("straight", "random"):
         env = environment(hunted(mode, farthest=2.5), worlds=32)
@@ -161,7 +164,7 @@ def test_a_straight_prey_keeps_its_course_and_a_random_one_does_not():
 
 @pytest.mark.parametrize(("distance", "captured"), [(0.78, True), (0.82, False)])
 def test_captured_is_half_a_second_within_the_radius(distance, captured):
-    """A prey that may not move, beside a pursuer that does not: after 5 steps and not after 4."""
+    """With prey and pursuer at rest, capture comes after 5 steps and not after 4."""
     env = environment(STILL)
     place(env, (0.0, 0.0, -3.0), (distance, 0.0, -3.0))
     ended = [env.step(np.zeros((8, 4))).terminated.all() for _ in range(5)]
@@ -174,7 +177,7 @@ def test_captured_is_half_a_second_within_the_radius(distance, captured):
 
 
 def test_a_pursuer_that_rushes_by_has_not_captured():
-    """Within the radius for longer than half a second, but faster than 0.35 m/s."""
+    """It is within the radius for longer than half a second, but faster than 0.35 m/s."""
     env = environment(STILL)
     place(env, (-0.4, 0.0, -3.0), (0.0, 0.2, -3.0))
     state = env.simulator.state
@@ -200,7 +203,7 @@ def test_leaving_the_bounds_ends_the_episode_and_costs():
 
 
 def test_lead_pursuit_captures_and_a_still_vehicle_does_not():
-    """Every mode of prey at once, each mode a fourth of the worlds or so."""
+    """All modes of prey occur, each in about a fourth of the worlds."""
     env, chaser = environment(Pursuit(), worlds=32), baseline("pursuit", "lead")
     rates = {}
     for who in ("lead", "still"):
@@ -216,7 +219,7 @@ def test_lead_pursuit_captures_and_a_still_vehicle_does_not():
 
 @pytest.mark.parametrize("action", ["wrench4", "wrench6"])
 def test_a_world_does_not_know_how_many_there_are(action):
-    """World w of 5 and of 200 live through the same, prey and all, over several episodes; other seeds do not."""
+    """World w of 5 and of 200 are identical, prey included, over several episodes; other seeds differ."""
 
     def one(worlds, seed=3):
         env = Environment(Pursuit(time_limit=1.5), worlds=worlds, seed=seed, action=action)
@@ -244,7 +247,7 @@ def test_what_does_not_fit_is_refused():
 
 
 def test_a_prey_has_its_whole_thrust_however_gently_the_agents_act():
-    """What 1 stands for is the agents' own."""
+    """The scale of action 1 applies to the agents only."""
     speeds = []
     for part in (1.0, 0.1):
         env = Environment(Pursuit(prey=Prey(mode="straight")), worlds=2, seed=1, wrench_scale=part)

@@ -1,4 +1,4 @@
-"""Randomisation of every task, and of worlds with several vehicles: each is drawn on its own."""
+"""Randomisation of every task, and of worlds with several vehicles: each vehicle is drawn separately."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_every_task_runs_with_drawn_vehicles_and_privileged_numbers(task):
 
 
 def test_the_vehicles_of_a_world_share_its_water():
-    """And nothing else: chaser and prey have thrusters of their own."""
+    """They share nothing else: chaser and prey have their own thrusters."""
     env = make("pursuit", worlds=30, randomize="pool", seed=5)
     drawn = env.draws.numpy(["current", "thrust.all"])
     np.testing.assert_array_equal(drawn[:, 0, 0], drawn[:, 1, 0])
@@ -44,7 +44,7 @@ def test_the_vehicles_of_a_world_share_its_water():
 
 @pytest.mark.slow
 def test_no_vehicle_of_one_seed_is_another_of_the_next_seeds():
-    """Trainings of seeds 1, 2, 3, ... share no vehicle, in whatever place."""
+    """Trainings of seeds 1, 2, 3, ... share no vehicle at any index."""
     first, *others = (
         make("pursuit", worlds=4, randomize="fossen_learn_to_swim", seed=1 + k).draws.numpy()[0, v, 0]
         for k, v in [(0, 1), *((k, 0) for k in range(20))]

@@ -1,4 +1,4 @@
-"""3-v-1 pursuit: the net's geometry, every capture mode and level, rewards by agent, the formation baseline."""
+"""3-v-1 pursuit: geometry of the net, every capture mode and level, rewards by agent, the formation baseline."""
 
 import math
 from dataclasses import replace
@@ -21,7 +21,7 @@ def environment(task, worlds=4, **options):
 
 
 def place(env, herder, left, right, prey):
-    """All four somewhere, at rest, in every world; the first step follows."""
+    """Place all four at rest in every world; the first step follows."""
     x = np.broadcast_to(np.float32([herder, left, right, prey]), (env.worlds, 4, 3))
     env.simulator.state.position.assign(np.ascontiguousarray(x))
     env.simulator.state.velocity.zero_()
@@ -32,7 +32,7 @@ def still(env):
 
 
 def test_distance_to_the_net_is_the_least_over_its_points():
-    """Against a grid of 1 cm over the net, whatever its slope."""
+    """The distance equals the least over a grid of 1 cm on the net, at any slope."""
     rng = np.random.default_rng(0)
     for _ in range(20):
         left, right, x = rng.uniform(-1.0, 1.0, (3, 3))
@@ -48,7 +48,7 @@ def test_distance_to_the_net_is_the_least_over_its_points():
 
 
 NET = ((0.0, 0.0, -3.0), (3.0, 1.0, -3.0), (3.0, -1.0, -3.0))
-"""A herder, and netters 2 m apart; the net's middle lies 3 m before the herder."""
+"""Herder, and netters 2 m apart; the net's middle lies 3 m before the herder."""
 
 
 @pytest.mark.slow
@@ -67,7 +67,7 @@ NET = ((0.0, 0.0, -3.0), (3.0, 1.0, -3.0), (3.0, -1.0, -3.0))
     ],
 )
 def test_every_capture_mode(mode, x, steps):
-    """A prey that may not move, at a distance just enough or not."""
+    """A prey at rest is just within reach or just beyond it."""
     env = environment(TeamPursuit(capture=mode, prey_speed=0.0))
     place(env, *NET, (x, 0.0, -3.0))
     ended = [still(env).terminated.all() for _ in range(4)]
@@ -83,7 +83,7 @@ def test_a_net_stretched_beyond_its_length_does_not_catch():
 
 
 def test_the_levels_are_the_published_ones():
-    """Prey speeds 0.25, 0.30, 0.40 of 0.5 m/s; rules and stakes as published; settings given beside it win."""
+    """Prey speeds are 0.25, 0.30, 0.40 of 0.5 m/s; rules and stakes are as published; explicit settings win."""
     top = DriveNumbers.of(load_vehicle("finsrov")).terminal[0]
     expected = [("proximity", 0.50, 25.0), ("net", 0.60, 25.0), ("net", 0.80, 30.0)]
     for level, (capture, part, stake) in enumerate(expected):
@@ -98,7 +98,7 @@ def test_the_levels_are_the_published_ones():
 
 
 def test_the_observation():
-    """Of every agent, against SciPy: the prey, then both team-mates in order."""
+    """The observation of every agent equals SciPy's: the prey, then both team-mates in order."""
     env = environment(TeamPursuit())
     rng = np.random.default_rng(0)
     for _ in range(20):
@@ -136,7 +136,7 @@ def test_the_worlds_reward_is_the_mean_of_its_agents():
 
 
 def test_progress_adds_up_to_the_way():
-    """The sum of the progress terms is what the gap has become smaller by."""
+    """The sum of the progress terms is the decrease of the gap."""
     weights = dict.fromkeys(("distance", "step", "drive", "stray", "spread", "bump", "action", "change"), 0.0)
     task = TeamPursuit()
     env = environment(TeamPursuit(reward=type(task.reward)(progress=1.0, **weights)), worlds=8)
@@ -148,7 +148,7 @@ def test_progress_adds_up_to_the_way():
 
 
 def test_a_herder_that_strays_loses_by_its_distance_to_the_prey():
-    """By d / 8 m up to one, and nobody else does."""
+    """The penalty is d / 8 m up to one, and applies to the herder only."""
     reward = TeamPursuit().reward
     near, far = (environment(TeamPursuit(reward=replace(reward, stray=x))) for x in (0.0, 0.8))
     for x, part in (((2.0, 0.0, -3.0), 0.5), ((-5.0, 0.0, -3.0), 1.0)):
@@ -168,7 +168,7 @@ def test_one_agent_out_of_bounds_costs_everybody():
 
 
 def rate(task, who, worlds=32, vehicle="finsrov"):
-    """Share of worlds in which the prey is captured."""
+    """Return the share of worlds in which the prey is captured."""
     env, team = environment(task, worlds=worlds, vehicle=vehicle), baseline("team-pursuit", "formation")
     observation, caught = env.arrays.observation.numpy().reshape(worlds, 3, 30), np.zeros(worlds, dtype=bool)
     for _ in range(600):
@@ -193,7 +193,7 @@ def test_the_formation_captures_on_messages_alone():
 
 
 def test_vehicles_may_differ_in_type():
-    """The prey is tied to the slowest of the three, and is as thick as its own hull."""
+    """The prey's speed follows the slowest of the three, and its thickness is that of its own hull."""
     finsrov = load_vehicle("finsrov")
     heavy = load_vehicle("bluerov2_heavy").replace(
         {f"water.{k}": v for k, v in finsrov.water.model_dump().items()}
@@ -207,7 +207,7 @@ def test_vehicles_may_differ_in_type():
 
 
 def test_a_world_does_not_know_how_many_there_are():
-    """World w of 5 and of 200 live through the same over several episodes, messages and all."""
+    """World w of 5 and of 200 are identical over several episodes, messages included."""
 
     def one(worlds, seed=3):
         task = TeamPursuit(time_limit=1.5, communication=Communication(period=0.3, loss=0.3))
@@ -237,7 +237,7 @@ def test_a_world_that_breaks_is_terminated_and_rewards_nobody(tmp_path, capsys):
 
 
 def test_a_run_goes_on_from_a_saved_state():
-    """Bit for bit, with messages under way."""
+    """It is bit-identical, with messages in transit."""
 
     def made():
         task = TeamPursuit(communication=Communication(period=0.3, loss=0.3, processing=0.7))

@@ -1,4 +1,4 @@
-"""Each test process talks on a ROS domain of its own, over the loopback alone."""
+"""Each test process uses its own ROS domain, over the loopback only."""
 
 import importlib.util
 import os

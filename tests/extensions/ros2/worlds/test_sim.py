@@ -1,5 +1,5 @@
 # ruff: noqa: E402 - rclpy can be imported once a backend is active
-"""A simulated vehicle on the wire: what it says, who may drive it, and how it is stopped."""
+"""A simulated vehicle on the wire: its messages, its commanders, and stopping it."""
 
 import json
 import math
@@ -25,7 +25,7 @@ STATES = ("disarmed", "armed", "hold", "fault")
 
 
 class World:
-    """A sim whose time we let go on, and a peer that talks to it over the wire."""
+    """Sim that the test advances, and a peer that communicates with it over the wire."""
 
     def __init__(self, sim, peer):
         self.sim, self.peer, self.heard = sim, peer, {}
@@ -56,11 +56,11 @@ class World:
         self._out[key].publish(message or ros_type(TOPICS[key].type)(**fields))
 
     def ask(self, force, source="peer", stamp=None):
-        """A command stamped now, by simulated time."""
+        """Send a command stamped with the current simulated time."""
         self.send("command", self.make.command(self.sim.ns(stamp or self.sim.time), force, source))
 
     def steps(self, n):
-        """So many steps of the world, each with the messages that have come."""
+        """Run n steps of the world, each with the messages received so far."""
         for _ in range(n):
             for node in (self.sim, self.peer):
                 for _ in range(20):
@@ -68,7 +68,7 @@ class World:
             self.sim._step()
 
     def until(self, condition, each=lambda: None):
-        """Let the world go on until a condition holds; whether it does in time."""
+        """Advance the world until a condition is true; return whether it became true in time."""
         end = time.monotonic() + PATIENCE
         while not condition() and time.monotonic() < end:
             each()
@@ -81,7 +81,7 @@ class World:
         return STATES[self.heard["thrusters"][-1].state] if self.heard["thrusters"] else ""
 
     def armed(self):
-        """Arm by the topic, commands at zero; whether the state says so."""
+        """Arm by the topic with commands at zero; return whether the state is armed."""
 
         def each():
             self.ask(np.zeros(self.count))
@@ -92,7 +92,7 @@ class World:
 
 @pytest.fixture(scope="module")
 def wire():
-    """The process's presence."""
+    """Participant of this process."""
     rclpy.init(args=[])
     yield
     rclpy.try_shutdown()
@@ -100,7 +100,7 @@ def wire():
 
 @pytest.fixture
 def world(wire):
-    """A fresh sim that goes on only when told to."""
+    """Fresh sim that advances only on request."""
     sim, peer = Sim(), Node("peer")
     for timer in list(sim.timers):
         if timer.callback == sim._turn:
@@ -110,7 +110,7 @@ def world(wire):
 
 
 def test_time_goes_on_by_steps_and_everything_carries_it(world):
-    """/clock, Odometry, EstimatorStatus and sensors of one step have one stamp; the state is the engine's."""
+    """/clock, Odometry, EstimatorStatus and sensors of a step share one stamp; the state is the engine's."""
     assert world.until(lambda: world.heard["clock"] and world.heard["imu"] and world.heard["pressure"])
     world.steps(3)
     assert world.until(lambda: len(world.heard["odometry"]) > 3)
@@ -124,7 +124,7 @@ def test_time_goes_on_by_steps_and_everything_carries_it(world):
 
 
 def test_only_an_explicit_word_arms(world):
-    """Commands, acknowledgements and a false do nothing; true on the topic arm does, and then thrust passes."""
+    """Commands, acknowledgements and `false` do not arm; `true` on the topic does, and then thrust passes."""
     force = np.full(world.count, 1.0)
     for _ in range(20):
         world.ask(force)
@@ -142,11 +142,11 @@ def test_only_an_explicit_word_arms(world):
 
 
 def test_a_stop_is_a_fault_until_it_is_acknowledged(world):
-    """Arming is refused meanwhile, and the acknowledged vehicle is disarmed."""
+    """Arming is refused until then, and the acknowledged vehicle is disarmed."""
     assert world.armed()
     world.send("stop")
     assert world.until(lambda: world.state == "fault")
-    world.steps(70)  # the same event is told once a second
+    world.steps(70)  # the same event is published once a second
     world.send("arm", data=True)
     world.steps(10)
     assert world.state == "fault" and "emergency stop" in world.heard["thrusters"][-1].reason
@@ -157,7 +157,7 @@ def test_a_stop_is_a_fault_until_it_is_acknowledged(world):
 
 
 def test_a_silent_commander_leaves_no_thrust(world):
-    """Half a second after the last command."""
+    """Thrust ends half a second after the last command."""
     assert world.armed()
     force = np.full(world.count, 1.0)
     assert world.until(lambda: np.any(world.heard["thrusters"][-1].force), lambda: world.ask(force))
@@ -170,7 +170,7 @@ def test_a_silent_commander_leaves_no_thrust(world):
 
 @pytest.mark.parametrize("source", ["peer", "somebody else"])
 def test_a_second_publisher_is_a_fault(world, source):
-    """Under another name at once; under the same name because there are two on the topic."""
+    """Another name is a fault at once; the same name is one because the topic has two publishers."""
     assert world.armed()
     first = world._out["command"]
     second = world.publisher("command")
@@ -185,7 +185,7 @@ def test_a_second_publisher_is_a_fault(world, source):
 
 @pytest.mark.parametrize("attempt", range(10))
 def test_a_second_publisher_that_leaves_at_once_is_a_fault(world, attempt):
-    """Under the same name, and gone before anybody could count: its one command moves nothing."""
+    """Under the same name and gone before a count, its one command moves nothing."""
     assert world.armed()
     rival = world.publisher("command")
     assert world.until(lambda: rival.get_subscription_count() == 1, lambda: world.ask(np.zeros(world.count)))
@@ -199,7 +199,8 @@ def test_a_second_publisher_that_leaves_at_once_is_a_fault(world, attempt):
 
 
 def test_malformed_commands_are_no_sign_of_life(world):
-    """Wrong names, NaN, too few, an old stamp: none raises, none moves anything, and the vehicle holds."""
+    """Wrong names, NaN, too few values and an old stamp neither raise nor move the vehicle, which holds its
+    position."""
     assert world.armed()
 
     def bad():
@@ -213,7 +214,7 @@ def test_malformed_commands_are_no_sign_of_life(world):
 
 
 def test_services_say_what_the_topics_do(world):
-    """set_armed with an answer, reset back to the start."""
+    """set_armed returns an answer, and reset returns the vehicle to the start."""
     world.steps(5)
     for name, kind, wanted in (
         ("set_armed", "std_srvs/srv/SetBool", {"data": True}),
@@ -230,7 +231,7 @@ def test_services_say_what_the_topics_do(world):
 
 
 def sim_in(namespace):
-    """A simulator as `--namespace` starts one."""
+    """Return a simulator as started with `--namespace`."""
     context = rclpy.get_default_context()
     before, words = context.arguments, ["--ros-args", "-r", f"__ns:=/{namespace}"]
     context.arguments = parse_arguments(words)
@@ -242,7 +243,7 @@ def sim_in(namespace):
 
 @pytest.fixture
 def pair(wire):
-    """Two simulators of one domain, whose own time stands still; the later has the name that comes first."""
+    """Two simulators of one domain with their own time stopped; the later one's name sorts first."""
     sims = [sim_in("robot_2"), sim_in("robot_1")]
     for sim in sims:
         for timer in list(sim.timers):
@@ -254,7 +255,7 @@ def pair(wire):
 
 
 def spun(nodes, condition, each=lambda: None):
-    """Run callbacks until a condition holds; whether it does in time."""
+    """Run callbacks until a condition is true; return whether it became true in time."""
     end = time.monotonic() + PATIENCE
     while not condition() and time.monotonic() < end:
         each()
@@ -264,7 +265,8 @@ def spun(nodes, condition, each=lambda: None):
 
 
 def test_of_two_simulators_one_publishes_the_clock_and_both_live_by_it(pair):
-    """One publisher of /clock; every stamp of the second is of that time, and its vehicle moves by the same steps."""
+    """/clock has one publisher; every stamp of the second is of that time, and its vehicle moves by the same
+    steps."""
     first, second = pair
     heard, peer = [], Node("peer")
     kind, quality = ros_type(TOPICS["odometry"].type), quality_profile(TOPICS["odometry"].quality)
@@ -276,7 +278,7 @@ def test_of_two_simulators_one_publishes_the_clock_and_both_live_by_it(pair):
     stamps = [m.header.stamp.sec + 1e-9 * m.header.stamp.nanosec for m in heard]
     assert 40.0 - MOST_BEHIND * STEP < min(stamps) and max(stamps) <= first.time + 1e-6
     before = len(heard)
-    for _ in range(10):  # one at a time, none is lost
+    for _ in range(10):  # one step at a time, so that none is lost
         first._step()
         assert spun([second, peer], lambda: second.time == pytest.approx(first.time, abs=0.1 * STEP))
     assert spun([peer], lambda: len(heard) >= before + 10)
@@ -284,7 +286,7 @@ def test_of_two_simulators_one_publishes_the_clock_and_both_live_by_it(pair):
 
 
 def test_a_simulator_that_cannot_keep_up_leaves_steps_out_but_not_time(pair):
-    """After a leap of the clock its stamps are those of the clock, so that nobody takes its state for an old one."""
+    """After a leap its stamps are those of the clock, so that its state is not mistaken for an old one."""
     first, second = pair
     assert spun([second], lambda: second.time > 0.0, first._step)
     made = []
@@ -297,7 +299,7 @@ def test_a_simulator_that_cannot_keep_up_leaves_steps_out_but_not_time(pair):
 
 
 def test_who_followed_takes_over_without_a_jump(pair):
-    """When the first simulator has left."""
+    """The second continues when the first simulator has left."""
     first, second = pair
     first.time = 7.0
     assert spun([second], lambda: second.time > 7.0, first._step)
@@ -309,10 +311,11 @@ def test_who_followed_takes_over_without_a_jump(pair):
 
 
 def test_of_two_that_started_together_one_gives_way(pair, monkeypatch):
-    """Both published before they saw each other: the first by name continues, and soon there is one clock."""
+    """Both published before they discovered each other: the first by name continues, and soon there is one
+    clock."""
     monkeypatch.setattr(
         "finssim.extensions.ros2.worlds.clock.CLAIMING", math.inf
-    )  # whatever time the test takes
+    )  # for any duration of the test
     first, second = pair
     now = 1e-9 * second.clock._steady.now().nanoseconds
     second.clock._claim(now)

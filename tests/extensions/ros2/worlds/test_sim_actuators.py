@@ -1,5 +1,5 @@
 # ruff: noqa: E402 - rclpy can be imported once a backend is active
-"""Fins on the wire of ROS 2: a simulated torpedo is steered by joints."""
+"""Fins in ROS 2: a simulated torpedo is steered by joints."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ from reference.finned import torpedo_file
 
 
 class Torpedo(World):
-    """A torpedo's world; the peer hears its actuators and asks for values."""
+    """World of a torpedo; the peer receives its actuator states and sends commands."""
 
     def __init__(self, sim, peer):
         super().__init__(sim, peer)
@@ -34,7 +34,7 @@ class Torpedo(World):
         return TOPICS[key].under("torpedo")
 
     def steer(self, values):
-        """Values of the other actuators, and a thrust with which they act."""
+        """Send values of the other actuators, and a thrust with which they take effect."""
         self.send("setpoints", self.make.actuators(self.sim.ns(self.sim.time), values))
         self.ask(np.full(self.count, 5.0))
 
@@ -53,7 +53,7 @@ def world(tmp_path):
 
 @pytest.mark.slow
 def test_fins_follow_joints_while_armed_and_go_to_zero_afterwards(world):
-    """The topic `actuator_cmd` acts with the next thrusts; `actuator_states` has what the fins do."""
+    """The topic `actuator_cmd` acts with the next thrusts; `actuator_states` contains the fins' deflections."""
 
     def rudder():
         return world.heard["actuators"][-1].position[0] if world.heard["actuators"] else 0.0
@@ -69,7 +69,7 @@ def test_fins_follow_joints_while_armed_and_go_to_zero_afterwards(world):
 
 
 def test_joints_of_other_names_are_refused(world):
-    """An event says so, and the fins stay."""
+    """An event reports the refusal, and the fins do not move."""
     assert world.armed()
     message = world.make.actuators(world.sim.ns(world.sim.time), [0.2, 0.0, 0.0, 0.0])
     message.name = ["a", "b", "c", "d"]

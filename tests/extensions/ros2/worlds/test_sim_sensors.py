@@ -1,4 +1,4 @@
-"""Perfect instruments obey mechanics."""
+"""Ideal sensors obey mechanics."""
 
 import numpy as np
 import pytest
@@ -14,19 +14,19 @@ TURN = np.asarray(quat_from_euler(0.2, -0.1, 1.0))
 
 
 def reading(nu, time=0.0):
-    """A tilted vehicle."""
+    """Return the reading of a tilted vehicle."""
     return Reading(time, np.array([0.0, 0.0, -0.8]), TURN, np.array(nu, float), True)
 
 
 def test_at_rest_the_specific_force_is_upwards():
-    """f = R_sw g z, |f| = g; the gyro is silent."""
+    """f = R_sw g z, |f| = g; the gyro reads zero."""
     sample = IdealSensors(VEHICLE).sample(reading(np.zeros(6)), 0.01)
     up = quat_inverse_rotate(quat_multiply(TURN, MOUNT), (0.0, 0.0, VEHICLE.water.gravity))
     assert sample.accel == pytest.approx(tuple(up)) and sample.gyro == pytest.approx((0.0,) * 3)
 
 
 def test_a_change_of_velocity_is_felt():
-    """f - g = Δv / Δt, in the sensor's axes; rates are those of the body, turned by the mount."""
+    """f - g = Δv / Δt in sensor axes; rates are those of the body, turned by the mount."""
     sensors = IdealSensors(VEHICLE)
     rest = sensors.sample(reading(np.zeros(6)), 0.01)
     moved = sensors.sample(reading([0.05, 0.0, 0.0, 0.1, 0.2, 0.3]), 0.01)
@@ -38,7 +38,7 @@ def test_a_change_of_velocity_is_felt():
 
 
 def test_pressure_is_that_of_the_water_above_the_port():
-    """p = p0 + rho g d."""
+    """Pressure is p = p0 + rho g d."""
     sample = IdealSensors(VEHICLE).sample(reading(np.zeros(6)), 0.01)
     water = VEHICLE.water
     assert sample.pressure - 101_325.0 == pytest.approx(water.density * water.gravity * sample.depth)
