@@ -79,7 +79,7 @@ def test_a_bounce_gives_back_the_energy_and_no_more(integrator):
     half = 0.5 * np.array(vehicle.body.size)
     elastic = replace(dock_of(vehicle), damping=0.0, friction=0.0)
     start = shots(np.random.default_rng(0), 64, elastic, half, 0.3)
-    # Where a point slides over an edge the depth's gradient jumps, which no step size resolves.
+    # Where a point slides over an edge, the depth's gradient jumps, which no step size resolves.
     for dock, least, most in (
         (elastic, 0.97, 1.03),
         (replace(elastic, damping=150.0, friction=0.2), 0.0, 1.0),
@@ -106,7 +106,7 @@ def test_nothing_goes_through_at_the_speed_the_dock_is_built_for(name):
     worlds = simulator(vehicle, dock, 128)
     start = shots(np.random.default_rng(1), 128, dock, half, task.hull.speed)
     worlds.place(*(a[:, None] for a in start))
-    # Pushed on all the time with what kept it at that speed.
+    # Pushed throughout with the wrench that maintains its speed.
     push = vehicle.wrench_limits[0] * np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     disturb(worlds, push)
     worst = 0.0
@@ -115,13 +115,13 @@ def test_nothing_goes_through_at_the_speed_the_dock_is_built_for(name):
         position = worlds.numpy("position")[:, 0] + [0.0, 0.0, 5.0]
         worst = max(worst, deepest(dock, position, worlds.numpy("quaternion")[:, 0], half).max())
     assert 0.0 < worst < 0.5 * dock.rim
-    # The bore's end holds whoever is in it.
+    # The end of the bore stops any vehicle inside it.
     inside = np.hypot(position[:, 1], position[:, 2]) < dock.throat_radius
     assert position[inside, 0].max() < dock.tube_length
 
 
 def test_touching_leaves_no_trace_where_nothing_is_touched():
-    """Far from the dock a vehicle moves as without one, to the rounding of another kernel."""
+    """Far from the dock a vehicle moves as without one, to the rounding differences between the two kernels."""
     runs = []
     for dock in (dock_of(FINSROV), None):
         worlds = Simulator("finsrov", worlds=2, dock=dock, control_step=0.1, substeps=20)

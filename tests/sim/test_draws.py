@@ -86,7 +86,7 @@ def expected_plant(x, vehicle):
 
 VEHICLE_ENTRIES = [
     e.name
-    for e in ENTRIES[:WORLD_END]  # those of terms and actuators come after
+    for e in ENTRIES[:WORLD_END]  # fields of terms and actuators follow
     if not e.world and not e.name.startswith(("sensors.", "tether.", "mesh_drag"))
 ]
 
@@ -94,7 +94,7 @@ VEHICLE_ENTRIES = [
 @pytest.mark.slow
 @pytest.mark.parametrize("name", VEHICLE_ENTRIES)
 def test_an_entry_does_to_the_plant_what_its_closed_form_says(name):
-    """All fields, so that an entry does nothing else either."""
+    """All fields are compared, so that an entry has no other effects."""
     simulator, draws = draw(parts_for(name), worlds=12)
     assert name in draws.names
     values = draws.values.numpy()[:, 0].astype(float)
@@ -115,7 +115,7 @@ def test_mesh_drag_scales_form_and_skin_drag():
 
 
 def test_surge_damping_scales_what_the_vehicle_has():
-    """Catalogue vehicles have no coupled damping: one that has."""
+    """Catalogue vehicles have no coupled damping, so the vehicle here has some."""
     vehicle = load_vehicle("finsrov")
     coupled = np.diag([0.0, 4.0, 0.0, 0.0, 0.0, 2.0]).tolist()
     vehicle = vehicle.replace({"hydrodynamics.calibrated.surge_damping": coupled})
@@ -140,7 +140,7 @@ def test_a_sensors_entry_replaces_its_own_number_and_keeps_the_others(name):
 @pytest.mark.parametrize("given", [TetherLine(anchor=(1.0, 0.0, 0.0), diameter=0.01, wet_weight=0.2), None])
 @pytest.mark.parametrize("name", ["diameter", "drag_coefficient", "wet_weight"])
 def test_a_tethers_entry_replaces_its_own_number_and_keeps_the_others(name, given):
-    """A line is made where none is given."""
+    """A default tether is used where none is given."""
     simulator, draws = draw(parts_for(f"tether.{name}"), worlds=12, tether=given)
     line = given or TetherLine()
     found = simulator.tether.array.numpy()[:, 0]
@@ -168,7 +168,7 @@ def test_current_and_drift_are_written_on_top_of_what_is_given():
     np.testing.assert_allclose(simulator.water.drift_time.numpy(), time, rtol=1e-6)
     simulator.step()
     drift = simulator.water.drift.numpy()[:, :2] / np.maximum(deviation, 1e-9)[:, None]
-    assert drift.std() == pytest.approx(1.0, abs=0.15)  # the first value is normal with that deviation
+    assert drift.std() == pytest.approx(1.0, abs=0.15)  # the first value is normal with this standard deviation
 
 
 def test_waves_follow_the_given_one_on_the_dispersion_relation():
@@ -190,7 +190,7 @@ def test_waves_follow_the_given_one_on_the_dispersion_relation():
 
 
 def test_a_thruster_that_failed_gives_nothing():
-    """Each fails on its own; what is left is drawn too."""
+    """Thrusters fail independently; the remaining thrust is drawn too."""
     parts = {"thrust": {"failure": {"uniform": [0.0, 0.0], "probability": 0.25}}}
     simulator, draws = draw(parts, worlds=500)
     gain = simulator.plant.gain.numpy()[:, 0]
@@ -205,7 +205,7 @@ def test_a_thruster_that_failed_gives_nothing():
 
 
 def test_a_jittering_command_comes_later_by_up_to_the_jitter():
-    """Anew in every control step, and uniform; the rest of the delay stays."""
+    """The jitter is uniform and redrawn in every control step; the rest of the delay is unchanged."""
     simulator, draws = draw({"command_jitter": [0.04, 0.04], "delay": [2.0, 2.0]}, worlds=300)
     step = simulator.pipeline()
     draws.add_step(step, 7)
@@ -223,7 +223,7 @@ def test_a_jittering_command_comes_later_by_up_to_the_jitter():
 
 
 def test_draws_do_not_depend_on_how_many_worlds_and_threads_there_are():
-    """Bit for bit: eight worlds are the first eight of two hundred."""
+    """Eight worlds are bit-identical to the first eight of two hundred."""
     ranges = load_ranges("pool").model_dump(exclude={"name"})
     few, many = (draw(ranges, worlds=n, threads=t)[0] for n, t in ((8, 1), (200, 3)))
     for name, array in few.plant.fields.items():
@@ -243,7 +243,7 @@ def test_the_vehicles_of_a_world_differ_and_share_its_water():
 
 
 def test_an_entry_more_does_not_change_the_others():
-    """Each has a stream of its own."""
+    """Each entry has its own random stream."""
     one = column(draw({"slew": FACTOR})[1], "slew")
     two = column(draw({"mass": FACTOR, "slew": FACTOR})[1], "slew")
     np.testing.assert_array_equal(one, two)
@@ -326,14 +326,14 @@ def test_draws_of_every_set_fill_its_ranges(name):
             assert set(x) == {0.0, 1.0, 2.0}
             continue
         if entry.startswith("waves.") and entry.endswith("amplitude"):
-            x = x[x > 0.0]  # those beyond the count are absent
+            x = x[x > 0.0]  # components beyond the count are absent
         width = high - low
         assert low - 1e-5 <= x.min() and x.max() <= high + 1e-5
         assert x.min() <= low + 0.03 * width and x.max() >= high - 0.03 * width
 
 
 def test_the_dead_zone_widens_to_both_sides():
-    """[factor · dead_minus - added, factor · dead_plus + added], of motors whose dead zone is simulated."""
+    """For simulated dead zones they become [factor · dead_minus - added, factor · dead_plus + added]."""
     vehicle = load_vehicle("finsrov")
     vehicle = vehicle.replace({f"thrusters.{name}.domain": "speed" for name in vehicle.thruster_names})
     simulator, draws = draw({"dead_zone": FACTOR, "added_dead_zone": [0.0, 0.4]}, worlds=12, vehicles=vehicle)
@@ -347,9 +347,9 @@ def test_the_dead_zone_widens_to_both_sides():
 
 
 def test_each_world_feels_its_own_line():
-    """nu_dot changes by M⁻¹ [-ρ C d L |v| v / 8, 0, ...] for a line across it, C drawn, in a step of 0.1 ms.
+    """In a step of 0.1 ms a line across the flow changes nu_dot by M⁻¹ [-ρ C d L |v| v / 8, 0, ...], with C drawn.
 
-    In it the vehicle turns by ω_dot h v at most: 0.62 · 1e-4 · 0.5 [m/s²].
+    In this step the vehicle's rotation contributes at most ω_dot h v: 0.62 · 1e-4 · 0.5 [m/s²].
     """
     line, h = TetherLine(diameter=0.02), 1e-4
     parts = {"tether": {"drag_coefficient": [0.0, 2.0]}}

@@ -16,9 +16,9 @@ from vehicles.minnow import MINNOW
 
 
 def course_matrix(vehicle, u):
-    """A of (sway, yaw rate) at surge u of a vehicle with centre of gravity over the origin (Fossen 2021, eq. 6.104).
+    """Return A of (sway, yaw rate) at surge u with the centre of gravity above the origin (Fossen 2021, eq. 6.104).
 
-    Its rudder stands still in the flow: its lift is in proportion to v + x r.
+    The rudder is at zero deflection: its lift is proportional to v + x r.
     """
     chosen, m = vehicle.hydrodynamics["calibrated"], vehicle.body.mass
     A, Du, both = chosen.added_mass, chosen.surge_damping, np.ix_([1, 5], [1, 5])
@@ -30,7 +30,8 @@ def course_matrix(vehicle, u):
 
 
 def test_course_of_remus_in_closed_form():
-    """Munk moment against lift and yaw damping, all proportional to the speed: unstable at any."""
+    """Munk moment, lift and yaw damping are all proportional to the speed, so the course is unstable at any
+    speed."""
     vehicle = load_vehicle("remus100")
     top, motions = stability(vehicle)
     expected = np.linalg.eigvals(course_matrix(vehicle, top)).real.max()
@@ -51,7 +52,7 @@ def test_roll_of_a_vehicle_without_linear_damping_swings_at_its_natural_frequenc
 
 @pytest.mark.slow
 def test_a_disturbance_grows_in_the_simulation_as_it_is_reported():
-    """REMUS 100 at 2 m/s with a yaw rate of 0.002 rad/s: e-fold in the time of the eigenvalue."""
+    """REMUS 100 at 2 m/s with a yaw rate of 0.002 rad/s grows e-fold in the time of the eigenvalue."""
     vehicle = load_vehicle("remus100")
     values, vectors = np.linalg.eig(course_matrix(vehicle, 2.0))
     k = values.real.argmax()
@@ -82,7 +83,7 @@ def test_show_says_what_a_vehicle_does_without_control(capsys):
 
 @pytest.mark.slow
 def test_show_of_a_vehicle_whose_set_has_another_name(tmp_path, capsys):
-    """No model of the simulation has it: the rest is shown."""
+    """No simulation model has this parameter set; the rest is shown."""
     (tmp_path / "minnow.yaml").write_text(MINNOW.replace("  calibrated:", "  mine:"))
     assert boundary.run(app, ["vehicles", "show", str(tmp_path / "minnow.yaml")]) == 0
     assert "Without control" not in capsys.readouterr().out

@@ -1,4 +1,4 @@
-"""A number that stops being finite freezes its world, is reported with its last states, and never spreads."""
+"""A value that becomes non-finite freezes its world, is reported with the last states, and never spreads."""
 
 import csv
 
@@ -12,7 +12,7 @@ FIELDS = ("position", "quaternion", "velocity", "acceleration", "thrust")
 
 
 def simulation(model="calibrated", vehicles="finsrov", worlds=5, **keywords):
-    """Worlds with different starts in waves, thrusters at work."""
+    """Return worlds with different starts in waves, with working thrusters."""
     keywords = {"water": Water(waves=(Wave(amplitude=0.02, wavelength=3.0),), depth=5.0)} | keywords
     simulator = Simulator(vehicles, worlds=worlds, hydrodynamics=model, **keywords)
     n = len(simulator.vehicles)
@@ -23,7 +23,7 @@ def simulation(model="calibrated", vehicles="finsrov", worlds=5, **keywords):
 
 
 def spoil(simulator, world, vehicle=0, value=np.nan, where="thrust"):
-    """Write a bad number into a command, behind the door that would refuse it."""
+    """Write a bad number directly into a command, bypassing the check that would refuse it."""
     command = getattr(simulator.command, where).numpy().copy()
     command[world, vehicle, 3] = value
     getattr(simulator.command, where).assign(command)
@@ -33,7 +33,7 @@ def spoil(simulator, world, vehicle=0, value=np.nan, where="thrust"):
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 @ONE_VEHICLE_PER_MODEL
 def test_a_bad_command_freezes_its_world_and_no_other(model, value, where):
-    """World 2 stands still at its last finite state, for good; the others go on bitwise as if nothing had happened."""
+    """World 2 stays at its last finite state; the others continue bit-identically to an undisturbed run."""
     free, spoiled = simulation(model), simulation(model)
     for _ in range(3):
         free.step()
@@ -61,7 +61,7 @@ def test_a_state_that_runs_away_freezes_before_it_is_written():
 
 
 def test_a_bad_parameter_freezes_its_world():
-    """NaN in plant.mass of one world: that world freezes in its first step."""
+    """NaN in plant.mass of one world freezes that world in its first step."""
     simulator = simulation()
     mass = simulator.plant.mass.numpy().copy()
     mass[4] = np.nan
@@ -72,7 +72,7 @@ def test_a_bad_parameter_freezes_its_world():
 
 
 def test_one_vehicle_freezes_the_whole_world_that_holds_it():
-    """Two vehicles: the other one of that world stops too, and the other worlds do not."""
+    """With two vehicles, the other vehicle of the world stops too, and the other worlds do not."""
     simulator = simulation(vehicles=["finsrov", "finsrov"], worlds=3)
     spoil(simulator, 1, vehicle=1)
     simulator.step()
@@ -90,7 +90,7 @@ def rows(path):
 
 @pytest.mark.parametrize("steps", [3, 130])
 def test_the_report_holds_the_last_states(tmp_path, steps):
-    """Up to 50 rows per vehicle ending at the step that broke; each equals the state as it was after that step."""
+    """Up to 50 rows per vehicle end at the step of the failure; each equals the state after its step."""
     simulator = simulation(vehicles=["finsrov", "finsrov"], worlds=2)
     seen = []
     for _ in range(steps):
@@ -109,12 +109,12 @@ def test_the_report_holds_the_last_states(tmp_path, steps):
         assert [row["t"] for row in mine] == pytest.approx([0.1 * (k + 1) for k in range(first, steps + 1)])
         states = np.array([[row[name] for name in "x y z qx qy qz qw u v w p q r".split()] for row in mine])
         assert np.array_equal(states[:-1].astype(np.float32), np.array(seen)[first:, v])
-    # The vehicle whose command was bad did not move in the step that broke.
+    # The vehicle with the bad command did not move in the step of the failure.
     assert list(table[kept - 1].values())[3:] == pytest.approx(seen[-1][0].tolist(), rel=1e-6)
 
 
 def test_a_state_that_broke_is_the_last_row_of_the_report(tmp_path):
-    """Where the motion itself overflowed, the last row shows the number that is not finite."""
+    """If the motion itself overflowed, the last row contains the non-finite number."""
     simulator = simulation(worlds=1)
     simulator.step()
     spoil(simulator, 0, value=1e18, where="disturbance")
@@ -127,7 +127,7 @@ def test_a_state_that_broke_is_the_last_row_of_the_report(tmp_path):
 
 
 def test_each_freeze_is_reported_once_and_a_reset_world_lives_again(tmp_path):
-    """A second call has nothing new; after `place` the world moves, and a new freeze is a new report."""
+    """A second call reports nothing new; after `place` the world moves, and a new freeze is a new report."""
     simulator = simulation()
     spoil(simulator, 2)
     simulator.step()
@@ -146,7 +146,7 @@ def test_each_freeze_is_reported_once_and_a_reset_world_lives_again(tmp_path):
 
 
 def test_a_frozen_world_that_is_reset_alone_lives_again():
-    """reset(mask) thaws it where it stood; the other worlds keep their clocks."""
+    """reset(mask) unfreezes it at its pose; the other worlds keep their clocks."""
     simulator = simulation()
     for _ in range(2):
         simulator.step()

@@ -1,4 +1,4 @@
-"""What is randomised adds to the water that is given; it never replaces it."""
+"""Randomised water is added to the given water and never replaces it."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ GIVEN = Water(current=(0.3, 0.0, 0.0), waves=(Wave(amplitude=0.02, wavelength=4.
 
 
 def environment(ranges: Ranges) -> Environment:
-    """Sixty-four worlds of T1 in the given water."""
+    """Return sixty-four worlds of T1 in the given water."""
     return Environment(StationKeeping(), worlds=64, water=GIVEN, randomization=Randomization(ranges), seed=4)
 
 
 def test_a_drawn_current_keeps_the_waves_and_adds_to_the_current() -> None:
-    """Speeds of the drawn part fill 0 to 0.1 m/s, horizontally, around the given current."""
+    """Speeds of the drawn part cover 0 to 0.1 m/s, horizontally, around the given current."""
     water = environment(Ranges(name="current", current=(0.0, 0.1))).simulator.water
     drawn = water.current.numpy() - [0.3, 0.0, 0.0]
     speed = np.linalg.norm(drawn, axis=1)
@@ -28,7 +28,7 @@ def test_a_drawn_current_keeps_the_waves_and_adds_to_the_current() -> None:
 
 
 def test_drawn_waves_join_the_given_one_and_keep_the_current() -> None:
-    """The given wave stays in front; up to two more follow it."""
+    """The given wave remains first; up to two more follow it."""
     waves = WaveRanges(count=(0, 2), amplitude=(0.01, 0.03), wavelength=(3.0, 8.0))
     water = environment(Ranges(name="waves", waves=waves)).simulator.water
     amplitude = water.wave_amplitude.numpy()

@@ -1,4 +1,4 @@
-"""Orders of convergence, and stability of long steps with much added mass."""
+"""Orders of convergence, and stability of long steps with large added mass."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,8 @@ TAU = np.array([12.0, -8.0, 10.0, 1.0, -1.0, 1.5])
 
 
 def smooth(model):
-    """FinsROV without the kinks of |v| v and of faces that turn away from the flow, and slow to swing."""
+    """Return FinsROV without the kinks of |v| v and of faces that turn away from the flow, and with slow
+    oscillations."""
     slow = {"body.center_of_buoyancy": [0.0, 0.0, -0.06]}
     if model == "mesh":
         changes = {"hydrodynamics.mesh.form_drag": 0.0, "hydrodynamics.mesh.skin_drag": 0.5}
@@ -26,7 +27,7 @@ def smooth(model):
 
 
 def exact(vehicle, model, duration):
-    """The float64 reference's equation of motion, integrated to 1e-10: state (2, 13) at the end."""
+    """Integrate the float64 reference's equation of motion to 1e-10: state (2, 13) at the end."""
     given = numbers(vehicle, model)
 
     def rate(_, y):
@@ -47,7 +48,7 @@ def exact(vehicle, model, duration):
 
 
 def error_after(vehicle, model, integrator, steps, duration, end):
-    """Largest error of position [m], attitude and twist [m/s, rad/s]."""
+    """Return the largest error of position [m], attitude and twist [m/s, rad/s]."""
     simulator = Simulator(
         vehicle,
         worlds=2,
@@ -74,11 +75,11 @@ def error_after(vehicle, model, integrator, steps, duration, end):
 def test_errors_fall_with_the_integrators_order(model, integrator, order, steps):
     """Errors after 2 s under a constant wrench are C h^p: p is measured between float32 and the asymptote.
 
-    At most one order more: a term of the next order may still dominate where RK4's own is small.
+    The order is exceeded by at most one: a term of the next order may still dominate where RK4's own is small.
     """
     vehicle = smooth(model)
     if model == "mesh":
-        steps = tuple(2 * n for n in steps)  # hardly damped, it swings faster
+        steps = tuple(2 * n for n in steps)  # with little damping, it oscillates faster
     end = exact(vehicle, model, 2.0)
     errors = [error_after(vehicle, model, integrator, n, 2.0, end) for n in steps]
     measured = np.polyfit(np.log(steps), -np.log(errors), 1)[0]
@@ -86,7 +87,8 @@ def test_errors_fall_with_the_integrators_order(model, integrator, order, steps)
 
 
 def driven(name, integrator, substeps, worlds=64):
-    """Positions, twists and accelerations after 2 s of random commands at 70 % of the limits, all float64 copies."""
+    """Return positions, twists and accelerations after 2 s of random commands at 70 % of the limits, as
+    float64 copies."""
     vehicle = load(name)
     lower, upper = vehicle.force_limits
     rng = np.random.default_rng(0)
@@ -102,10 +104,10 @@ def driven(name, integrator, substeps, worlds=64):
 @pytest.mark.parametrize("integrator", ["midpoint", "rk4"])
 @pytest.mark.parametrize("name", ["finsrov", "bluerov2"])
 def test_a_driven_vehicle_is_integrated_to_second_order(name, integrator):
-    """Thrusters that lag, quadratic drag, a command every 0.1 s: errors fall by four when the step is halved.
+    """With thruster lag, quadratic drag and a command every 0.1 s, errors fall by four when the step is halved.
 
-    For RK4 too, which takes the mean thrust of a step in all its stages. The reference has steps of 1.25 ms, so that
-    it is 1/16 or less of the finer error off; FinsROV's slow motors leave RK4's error near float32's.
+    This applies to RK4 too, which uses the mean thrust of a step in all its stages. The reference has steps of 1.25 ms,
+    so that its error is 1/16 or less of the finer error; FinsROV's slow motors leave RK4's error near float32's.
     """
     exact = driven(name, "rk4", 80)
     coarse, fine = (driven(name, integrator, n) for n in ((8, 16) if name == "bluerov2" else (4, 8)))
@@ -122,7 +124,7 @@ def test_a_driven_vehicle_is_integrated_to_second_order(name, integrator):
 def test_the_acceleration_is_that_of_its_state():
     """`acceleration` equals the reference's in the state it is stored with, to second order in the step.
 
-    FinsROV after 0.5 s of steady commands, when its motors still change: 1 % off at 12.5 ms, a quarter of it at half.
+    FinsROV's motors still change after 0.5 s of steady commands: the error is 1 % at 12.5 ms, a quarter of it at half.
     """
     vehicle, errors = load("finsrov"), []
     given = numbers(vehicle, "calibrated")
@@ -143,9 +145,9 @@ def test_the_acceleration_is_that_of_its_state():
 
 @pytest.mark.parametrize("name", ["finsrov", "bluerov2", "bluerov2_heavy"])
 def test_four_steps_of_the_midpoint_rule_do_better_than_ten_of_eulers(name):
-    """After 2 s of random commands the default is less than half as far off as semi-implicit Euler's ten steps were.
+    """After 2 s of random commands the default has less than half the error of ten semi-implicit Euler steps.
 
-    Those were, with this file's commands and starts, 3.3, 10.7 and 6.8 mm off (RMS), when last measured.
+    The latter's errors, with this file's commands and starts, were 3.3, 10.7 and 6.8 mm (RMS) when last measured.
     """
     euler = {"finsrov": 3.3e-3, "bluerov2": 10.7e-3, "bluerov2_heavy": 6.8e-3}[name]
     away = driven(name, "midpoint", 4)[0] - driven(name, "rk4", 80)[0]
@@ -156,7 +158,7 @@ def test_four_steps_of_the_midpoint_rule_do_better_than_ten_of_eulers(name):
 @pytest.mark.parametrize("substeps", [1, 4])
 @for_each([x for x in PAIRS if x[1] == "calibrated" and damped(load(x[0]), x[1])])
 def test_long_steps_are_stable_with_ten_times_the_mass_added(name, model, substeps):
-    """20 ms control steps, M_A = 10 M_RB on every axis: the terminal speed of each axis is reached and none runs away.
+    """In 20 ms control steps with M_A = 10 M_RB, every axis reaches its terminal speed and none diverges.
 
     As a force that is fed back, added mass beyond M_RB would diverge at once. 12 worlds, 0.5 m/s or 0.5 rad/s.
     """
@@ -184,7 +186,7 @@ def test_long_steps_are_stable_with_ten_times_the_mass_added(name, model, subste
     simulator = Simulator(vehicle, worlds=12, hydrodynamics=model, control_step=0.02, substeps=substeps)
     simulator.place((0.0, 0.0, -50.0), velocity=0.5 * speed * axes[:, None])
     disturb(simulator, (axes * (d1 * speed + d2 * speed**2))[:, None])
-    # Half of exp(-6) is left after 6 time constants.
+    # After 6 time constants half of exp(-6) remains.
     steps = np.tile(np.ceil(6.0 * time_constant / 0.02), 2).astype(int)
     for k in range(1, int(steps.max()) + 1):
         simulator.step()
@@ -210,7 +212,7 @@ def test_long_steps_are_stable_from_any_start_at_the_surface(substeps):
 
 @pytest.mark.parametrize("integrator", ["midpoint", "rk4"])
 def test_slow_motion_far_away_is_not_lost_in_rounding(integrator):
-    """The way of a substep, 16 µm, is less than half the spacing of floats at 1 km; that of a control step is not."""
+    """A substep's displacement, 16 µm, is less than half the float spacing at 1 km; a control step's is not."""
     moved = []
     for x in (0.0, 1000.0):
         simulator = Simulator("finsrov", control_step=0.08, substeps=50, integrator=integrator)

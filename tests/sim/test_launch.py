@@ -1,4 +1,4 @@
-"""Slices on threads: an interrupt leaves nothing behind, and a forked process makes threads of its own."""
+"""Slices on threads: an interrupt leaves no unfinished work, and a forked process starts its own threads."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from finssim.sim import Simulator, SimulatorError
 
 
 def simulator(threads: int) -> Simulator:
-    """Two slices or one, under random thrust."""
+    """Return a simulator of two slices or one under random thrust."""
     made = Simulator("finsrov", worlds=4096, threads=threads)
     made.set_thrust(np.random.default_rng(3).uniform(-5.0, 5.0, (4096, 1, 8)))
     return made
 
 
 def test_a_step_is_over_when_it_returns_even_after_an_interrupt() -> None:
-    """SIGINTs in the middle of steps; afterwards every step moves all slices by exactly one step."""
+    """After SIGINTs in the middle of steps, every step moves all slices by exactly one step."""
     threaded, alone = simulator(2), simulator(1)
     for delay in (1e-4, 3e-4, 6e-4, 1e-3, 2e-3):
         with pytest.raises(KeyboardInterrupt):
@@ -29,7 +29,7 @@ def test_a_step_is_over_when_it_returns_even_after_an_interrupt() -> None:
             lost = time.monotonic() + 5.0
             while True:
                 threaded.step()
-                if time.monotonic() > lost:  # Python drops an interrupt that falls into a destructor
+                if time.monotonic() > lost:  # Python drops an interrupt that occurs in a destructor
                     os.kill(os.getpid(), signal.SIGINT)
     for made in (threaded, alone):
         made.place(position=(0.0, 0.0, -5.0))
@@ -40,7 +40,8 @@ def test_a_step_is_over_when_it_returns_even_after_an_interrupt() -> None:
 
 
 def test_the_environment_limits_the_threads_of_who_names_none(monkeypatch) -> None:
-    """One slice a thread; a number in the call comes first, and nonsense is refused."""
+    """Each thread has one slice; a number in the call overrides the environment, and invalid values are
+    refused."""
 
     def slices(**options: int) -> int:
         return len(Simulator("finsrov", worlds=4096, **options).pipeline().slices)

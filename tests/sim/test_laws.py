@@ -1,4 +1,4 @@
-"""Laws that hold whatever the numbers: energy, momentum, invariance, symmetry, rest."""
+"""Laws that are valid for all parameters: energy, momentum, invariance, symmetry, rest."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,8 @@ EPS = float(np.finfo(np.float32).eps)
 
 
 def history(simulator, steps):
-    """Positions, attitudes and twists before the first control step and after each, float64 (steps + 1, worlds, n)."""
+    """Return positions, attitudes and twists before the first and after each control step, float64 (steps +
+    1, worlds, n)."""
     rows = []
     for k in range(steps + 1):
         if k:
@@ -37,9 +38,9 @@ def history(simulator, steps):
 
 
 def exactly(name):
-    """Integrator and substeps of a nearly exact motion: RK4, or the midpoint rule in ten times as many.
+    """Return integrator and substeps of a nearly exact motion: RK4, or the midpoint rule with ten times as many.
 
-    These three have a kernel of that for other tests; ECA A9 and REMUS 100 have fins too.
+    These three have a compiled RK4 kernel for other tests; ECA A9 and REMUS 100 have fins too.
     """
     if name in ("lauv", "slocum", "torpedo"):
         return {"integrator": "midpoint", "substeps": 40}
@@ -47,7 +48,8 @@ def exactly(name):
 
 
 def period(vehicle):
-    """A time in which a vehicle moves about a tenth of its length [s], for steps that suit a small and a large one."""
+    """Return the time in which a vehicle moves about a tenth of its length [s], for steps that suit all
+    sizes."""
     return 0.04 * float(np.sqrt(max(vehicle.body.size)))
 
 
@@ -60,7 +62,8 @@ def period(vehicle):
 def test_energy_never_grows_without_thrust(name, model, integrator):
     """T + V falls in every control step in still water, submerged and at the surface, from 40 random states.
 
-    RK4 to the rounding of T, V and the substeps' increments; the midpoint rule to its own error, h² aᵀ M a per step.
+    RK4 meets this to the rounding of T, V and the substeps' increments; the midpoint rule to its own error, h² aᵀ M a
+    per step.
     """
     vehicle = load(name)
     given = numbers(vehicle, model)
@@ -97,7 +100,8 @@ def test_energy_never_grows_without_thrust(name, model, integrator):
 def test_momentum_of_body_and_added_mass_is_conserved(name, model):
     """R p and x × R p + R h are constant for a neutral undamped body in still water, [p; h] = (M_RB + M_A) nu.
 
-    RK4, 200 steps; rounding of the state a step, and of weight less buoyancy at one ten-thousandth of gravity.
+    RK4, 200 steps; tolerance for rounding of the state per step, and of weight less buoyancy at one ten-thousandth of
+    gravity.
     """
     vehicle = weightless(load(name).replace({"water.gravity": 1e-3}), model)
     M = numbers(vehicle, model).M_RB + numbers(vehicle, model).M_A
@@ -127,7 +131,7 @@ CURRENT = np.array([0.3, -0.2, 0.1])
 
 
 def with_and_without_current(name, model, carried):
-    """The same 20 random starts in still water and in a steady current, moving with it if `carried`."""
+    """Run the same 20 random starts in still water and in a steady current, moving with it if `carried`."""
     vehicle = load(name)
     position, q, nu = random_states(np.random.default_rng(3), 20, depth=(-40.0, -30.0), speed=0.3, turn=0.3)
     runs = []
@@ -152,7 +156,7 @@ def with_and_without_current(name, model, carried):
 @pytest.mark.slow
 @for_each(RELATIVE)
 def test_a_steady_current_is_a_change_of_frame(name, model):
-    """In water that moves with U, everything happens as in still water, U t further on (Galilean invariance)."""
+    """In water that moves with U, motion is as in still water, displaced by U t (Galilean invariance)."""
     (still, moving), duration, length = with_and_without_current(name, model, carried=True)
     t = np.linspace(0.0, duration, len(still[0]))[:, None, None]
     assert moving[0] - t * CURRENT == pytest.approx(still[0], abs=1e-4 * length + 40.0 * 60 * EPS)
@@ -164,7 +168,7 @@ def test_a_steady_current_is_a_change_of_frame(name, model):
 
 @for_each([x for x in PAIRS if x[1] == "simplified"])
 def test_the_simplified_model_knows_no_current(name, model):
-    """By definition (paper, eq. 5) its damping is of nu: the run is the same with and without the current."""
+    """By definition (paper, eq. 5) its damping depends on nu: runs with and without the current are the same."""
     (still, moving), _, _ = with_and_without_current(name, model, carried=False)
     for a, b in zip(still, moving, strict=True):
         assert a == pytest.approx(b, abs=1e-5)
@@ -172,7 +176,7 @@ def test_the_simplified_model_knows_no_current(name, model):
 
 @for_each(RELATIVE)
 def test_a_neutral_body_moves_with_accelerating_water(name, model):
-    """At rest in drifting water, with r_b = r_g, it keeps the water's velocity, however it is turned."""
+    """At rest in drifting water, with r_b = r_g, it keeps the water's velocity in any attitude."""
     vehicle = neutral(load(name).replace({"water.gravity": 1e-3}))
     simulator = Simulator(
         vehicle,
@@ -189,7 +193,7 @@ def test_a_neutral_body_moves_with_accelerating_water(name, model):
     def drift():
         return simulator.water.drift.numpy() + 0.1 * simulator.water.drift_rate.numpy()
 
-    simulator.step()  # the drift starts somewhere of its own: join it
+    simulator.step()  # the drift has its own initial value: start with it
     nu = np.zeros((20, 1, 6), np.float32)
     nu[:, 0, :3] = (np.swapaxes(rotation(simulator.numpy("quaternion")[:, 0]), -1, -2) @ drift()[..., None])[
         ..., 0
@@ -208,9 +212,9 @@ def test_a_neutral_body_moves_with_accelerating_water(name, model):
 
 @pytest.mark.parametrize("climb", [0.3, -0.2])
 def test_a_body_that_crosses_a_shear_feels_the_water_change(climb):
-    """Rising at w through dU/dz = S with the water's own speed: (m + A) u_dot = A w S, with no drag in a first moment.
+    """Rising at w through dU/dz = S with the water's speed gives (m + A) u_dot = A w S, initially without drag.
 
-    At 0.5 /s and 0.3 m/s FinsROV's A/(m + A) makes that some 0.08 m/s².
+    At 0.5 /s and 0.3 m/s FinsROV's A/(m + A) makes this about 0.08 m/s².
     """
     vehicle = neutral(undamped(load("finsrov"), "calibrated"))
     origin = {"body.center_of_gravity": [0.0] * 3, "body.center_of_buoyancy": [0.0] * 3}
@@ -233,7 +237,8 @@ def test_a_body_that_crosses_a_shear_feels_the_water_change(climb):
 
 @pytest.mark.parametrize("model", ["calibrated", "mesh"])
 def test_a_small_body_follows_the_orbits_of_a_long_wave(model):
-    """Its velocity stays the water's, to what linear theory leaves out: (v·∇)v <= k |v|² since the start."""
+    """Its velocity stays the water's, up to the term omitted by linear theory: (v·∇)v <= k |v|² since the
+    start."""
     wave = Wave(amplitude=0.1, wavelength=30.0)
     vehicle = neutral(load("finsrov"))
     water = Water(waves=(wave,), depth=10.0)
@@ -255,7 +260,8 @@ def test_a_small_body_follows_the_orbits_of_a_long_wave(model):
 
 @EVERY_VEHICLE_AND_MODEL
 def test_a_neutrally_trimmed_vehicle_stays_put(name, model):
-    """Level, W = B, buoyancy straight above weight: for a minute it moves no more than the rounding of W allows."""
+    """Level, with W = B and buoyancy above weight, it moves in a minute no more than the rounding of W
+    allows."""
     vehicle = neutral(load(name), 0.02)
     simulator = Simulator(vehicle, hydrodynamics=model, control_step=0.1, substeps=4)
     simulator.place(position=(1.0, 2.0, -10.0))
@@ -270,7 +276,7 @@ MIRROR = np.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
 
 
 def symmetric(name, model):
-    """The vehicle, made symmetric to port and starboard where its numbers are not."""
+    """Return the vehicle, made symmetric to port and starboard where its parameters are not."""
     vehicle = load(name)
     chosen, body = vehicle.hydrodynamics[model], vehicle.body
 
@@ -282,7 +288,7 @@ def symmetric(name, model):
     inertia = np.asarray(body.inertia)
     changes["body.inertia"] = (0.5 * (inertia + np.outer(MIRROR[3:], MIRROR[3:]) * inertia)).tolist()
     for field in ("added_mass", "linear_damping", "quadratic_damping", "surge_damping"):
-        if np.any(getattr(chosen, field, 0.0)):  # a term of zeros would be a kernel more
+        if np.any(getattr(chosen, field, 0.0)):  # a term of zeros would compile another kernel
             changes[f"hydrodynamics.{model}.{field}"] = symmetrised(getattr(chosen, field))
     return vehicle.replace(changes)
 
@@ -290,7 +296,8 @@ def symmetric(name, model):
 @pytest.mark.slow
 @for_each([x for x in PAIRS if x != ("rexrov", "mesh")])
 def test_port_and_starboard_are_mirror_images(name, model):
-    """Mirrored start, current and waves, mirrored motion: y, v, p, r change sign. RexROV's hull is not symmetric."""
+    """Mirrored start, current and waves mirror the motion: y, v, p, r change sign. RexROV's hull is not
+    symmetric."""
     vehicle = symmetric(name, model)
     position, q, nu = random_states(np.random.default_rng(6), 20, depth=(-1.0, 0.1), speed=0.3, turn=0.3)
     runs = []

@@ -1,4 +1,4 @@
-"""Views of packed structs: they share memory, and keep it."""
+"""Views of packed structs share memory and keep it alive."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from finssim.sim.state import VehicleState
 
 
 def as_numpy(view: wp.array) -> Any:
-    """NumPy's view of the same memory."""
+    """Return NumPy's view of the same memory."""
     return view.numpy()
 
 
 def as_torch(view: wp.array) -> Any:
-    """Torch's view of the same memory."""
+    """Return Torch's view of the same memory."""
     return wp.to_torch(view, requires_grad=False)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("look", [as_numpy, as_torch, lambda view: view], ids=["numpy", "torch", "warp"])
 def test_a_view_keeps_the_memory_it_looks_at(look: Callable[[wp.array], Any]) -> None:
-    """Whoever holds a field holds the structs; when nobody does any more, they are freed."""
+    """A reference to a field keeps the structs alive; without references they are freed."""
     packed = Packed(VehicleState, (10, 1), wp.get_device("cpu"))
     memory = weakref.ref(packed.array)
     view = look(packed.position)
     del packed
-    gc.collect(1)  # what is older was there before
+    gc.collect(1)  # ignore older objects
     assert memory() is not None
     del view
     gc.collect(1)
@@ -41,7 +41,7 @@ def test_a_view_keeps_the_memory_it_looks_at(look: Callable[[wp.array], Any]) ->
 
 
 def test_a_field_is_the_struct() -> None:
-    """What is written to a field is in the struct, and the other way round."""
+    """A value written to a field is in the struct, and vice versa."""
     packed = Packed(VehicleState, (3, 2), wp.get_device("cpu"))
     packed.position.numpy()[1, 1] = [1.0, 2.0, 3.0]
     table = packed.array.numpy()

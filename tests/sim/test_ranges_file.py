@@ -1,4 +1,4 @@
-"""Ranges files: those that ship load, those that cannot be are refused in one sentence."""
+"""Ranges files: the packaged ones load, and invalid ones are refused in one sentence."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ FILES = {
 @pytest.mark.parametrize("case", FILES)
 @pytest.mark.parametrize("reader", READERS)
 def test_what_is_no_yaml_mapping_gets_the_same_sentence_from_every_reader(reader, case, tmp_path):
-    """Ranges, plants and vehicles are read by one reader."""
+    """One reader serves ranges, plants and vehicles."""
     (load, error), (content, sentence) = READERS[reader], FILES[case]
     path = tmp_path / "file.yaml"
     path.write_bytes(content)
@@ -98,7 +98,7 @@ IMPOSSIBLE = {
 
 @pytest.mark.parametrize("case", IMPOSSIBLE)
 def test_what_cannot_be_drawn_is_refused(case, tmp_path):
-    """The sentence names file, key, value and what was expected."""
+    """The message names file, key, value and the expected value."""
     text, sentence = IMPOSSIBLE[case]
     path = written(tmp_path, text + "\n")
     with pytest.raises(RangesError) as caught:

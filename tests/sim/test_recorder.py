@@ -1,4 +1,4 @@
-"""A recorded run is what was simulated, and a run that was cut short opens up to the cut."""
+"""A recorded run equals the simulation, and an interrupted run opens up to the interruption."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def run(folder: Path, steps: int, chunk: int, worlds: list[int] | None = None) -
 
 
 def test_the_last_row_is_the_last_state(tmp_path: Path) -> None:
-    """Rows hold clocks, states, commands and thrusts of the worlds asked for, and no others."""
+    """Rows contain clocks, states, commands and thrusts of the requested worlds only."""
     simulator = run(tmp_path / "run", steps=12, chunk=1000, worlds=[0, 2])
     table = read_run(tmp_path / "run")
     assert sorted(table["world"].unique()) == [0, 2] and len(table) == 24
@@ -42,7 +42,7 @@ def test_the_last_row_is_the_last_state(tmp_path: Path) -> None:
 
 
 def test_a_run_says_what_it_was(tmp_path: Path) -> None:
-    """Vehicle hash, model, times and seed travel with the run."""
+    """Vehicle hash, model, times and seed are stored with the run."""
     simulator = run(tmp_path / "run", steps=2, chunk=1000)
     about = read_run(tmp_path / "run").attrs
     assert about["vehicles"] == [{"name": "finsrov", "sha256": simulator.vehicles[0].sha256}]
@@ -50,7 +50,7 @@ def test_a_run_says_what_it_was(tmp_path: Path) -> None:
 
 
 def test_a_run_cut_short_opens_up_to_its_last_part(tmp_path: Path) -> None:
-    """Parts are whole files: without a close, all but the rows that waited are there."""
+    """Parts are whole files: without a close, only the buffered rows are missing."""
     simulator = Simulator("finsrov", worlds=3)
     recorder = StateRecorder(simulator, tmp_path / "run", chunk=6)
     for _ in range(5):
@@ -62,7 +62,7 @@ def test_a_run_cut_short_opens_up_to_its_last_part(tmp_path: Path) -> None:
 
 
 def test_an_error_in_the_run_keeps_its_rows(tmp_path: Path) -> None:
-    """Leaving the context by an exception, Ctrl-C included, writes what was recorded."""
+    """Leaving the context by an exception, Ctrl-C included, writes the recorded rows."""
     simulator = Simulator("finsrov")
     with pytest.raises(KeyboardInterrupt), StateRecorder(simulator, tmp_path / "run") as recorder:
         simulator.step()
@@ -85,7 +85,7 @@ def test_a_used_folder_and_a_missing_world_are_refused(tmp_path: Path) -> None:
 
 
 def test_other_actuators_have_columns_too(tmp_path: Path) -> None:
-    """Commands of all channels, thrust of thrusters, values of the others."""
+    """Columns are commands of all channels, thrust of thrusters, and values of the others."""
     simulator = Simulator(torpedo(), control_step=0.1)
     simulator.place(position=(0.0, 0.0, -5.0))
     simulator.set_actuators([5.0, 0.2, 0.0, 1e-4, 0.0])

@@ -1,4 +1,5 @@
-"""REMUS 100 beside PythonVehicleSimulator: straight, depth and heading, with its propeller, fins and autopilot."""
+"""REMUS 100 compared with PythonVehicleSimulator: straight, depth and heading, with propeller, fins and
+autopilot."""
 
 import math
 
@@ -13,7 +14,7 @@ from reference.remus import STEP, Autopilot, Remus, run, step_response
 STRAIGHT, DEPTH, TURN = 60.0, 400.0, 200.0
 """Durations of the runs [s]."""
 START = 2.0
-"""Depth of their starts [m]: so near the surface float32 holds a position to less than a micrometre."""
+"""Initial depth of the runs [m]: so near the surface float32 resolves a position to less than a micrometre."""
 
 
 def steered(vehicle, duration, **targets):
@@ -26,7 +27,8 @@ def steered(vehicle, duration, **targets):
 
 
 def test_the_reference_runs_as_pythonvehiclesimulator_reports():
-    """148 m in 60 s and 2.55 m/s at 1525 rpm, to the digits that its own program gives: 148.345431, 2.553646."""
+    """148 m in 60 s and 2.55 m/s at 1525 rpm agree with its own program to the printed digits: 148.345431,
+    2.553646."""
     _, eta, nu = run(Remus(), STRAIGHT, lambda eta, nu: (0.0, 0.0, 1525.0))
     assert eta[-1, 0] == pytest.approx(148.345431, abs=1e-5) and nu[-1, 0] == pytest.approx(
         2.5536456, abs=1e-6
@@ -38,7 +40,8 @@ def test_the_reference_runs_as_pythonvehiclesimulator_reports():
 
 @pytest.mark.slow
 def test_the_reference_steps_as_pythonvehiclesimulator_does():
-    """Its own program: 30 m of depth overshoots by 41.7439 mm and settles in 175.98 s, 50° of heading in 82.74 s."""
+    """In its own program a step of 30 m overshoots by 41.7439 mm and settles in 175.98 s, 50° of heading in
+    82.74 s."""
     times, eta, _ = steered(Remus(), DEPTH, depth=30.0)
     overshoot, settled = step_response(times, eta[:, 2], 30.0)
     assert overshoot * 30.0 == pytest.approx(0.041743944, abs=1e-6) and settled == pytest.approx(
@@ -51,12 +54,12 @@ def test_the_reference_steps_as_pythonvehiclesimulator_does():
 
 
 def simulated(vehicle, duration, fins):
-    """Motion from rest, as `run` gives it, with the propeller at 1525 rpm; float32 and one step every 20 ms.
+    """Return motion from rest like `run`, with the propeller at 1525 rpm; float32 and one step every 20 ms.
 
     Args:
-        vehicle: With the propeller first.
-        duration: Of the motion [s].
-        fins: Function of place and angles (6,), and velocity (6,), z down, to deflections by channel [rad].
+        vehicle: Vehicle with the propeller first.
+        duration: Duration of the motion [s].
+        fins: Function of pose (6,) and velocity (6,), z down, that returns deflections by channel [rad].
     """
     rows = []
     sim = Simulator(vehicle, control_step=STEP, substeps=1, threads=1)
@@ -73,7 +76,7 @@ def simulated(vehicle, duration, fins):
 
 
 def by_autopilot(**targets):
-    """Function of the state to the fins of `torpedo`, by the autopilot of the reference."""
+    """Return a function of the state that returns the fins of `torpedo`, by the reference's autopilot."""
     autopilot = Autopilot(**targets)
 
     def fins(eta, nu):
@@ -85,17 +88,19 @@ def by_autopilot(**targets):
 
 @pytest.mark.slow
 def test_torpedo_runs_straight_as_the_reference():
-    """Distance and speed within 2 %: 151.2 m in 60 s, as torpedo.py's shaft is faster than that of remus100.py."""
+    """Distance and speed agree within 2 %: 151.2 m in 60 s, as torpedo.py's shaft is faster than that of
+    remus100.py."""
     _, expected, _ = run(Remus(0.1, False), STRAIGHT, lambda eta, nu: (0.0, 0.0, 1525.0))
     _, eta, nu = simulated(load_vehicle("torpedo"), STRAIGHT, lambda eta, nu: (0.0,) * 4)
     assert eta[-1, 0] == pytest.approx(expected[-1, 0], rel=0.001) and abs(eta[-1, 1]) < 0.2
-    assert eta[-1, 3] == pytest.approx(expected[-1, 3], rel=0.01)  # the propeller's torque rolls it
+    assert eta[-1, 3] == pytest.approx(expected[-1, 3], rel=0.01)  # the propeller's torque rolls the vehicle
     assert nu[-1, 0] == pytest.approx(2.5536, rel=0.001)
 
 
 @pytest.mark.slow
 def test_remus100_runs_as_far_as_pythonvehiclesimulator():
-    """148 m in 60 s and 2.55 m/s within 2 %: Prestero's hull, ballasted neutral, kept straight by its fins."""
+    """148 m in 60 s and 2.55 m/s agree within 2 %: Prestero's hull, ballasted neutral, kept straight by its
+    fins."""
     vehicle = load_vehicle("remus100")
     vehicle = vehicle.replace({"body.displaced_volume": vehicle.body.mass / vehicle.water.density})
 
@@ -114,7 +119,8 @@ def test_remus100_runs_as_far_as_pythonvehiclesimulator():
     ids=["depth", "heading"],
 )
 def test_torpedo_steps_as_the_reference(duration, axis, target, name):
-    """A step of its own autopilot: overshoot and settling time within 5 % of the reference's, and its path."""
+    """With its own autopilot, overshoot and settling time are within 5 % of the reference's, and the path
+    agrees."""
     times, expected, _ = steered(Remus(0.1, False), duration, **{name: target})
     _, eta, _ = simulated(load_vehicle("torpedo"), duration, by_autopilot(**{name: target}))
     for found, of in zip(*(step_response(times, x[:, axis], target) for x in (eta, expected)), strict=True):

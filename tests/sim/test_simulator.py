@@ -1,4 +1,4 @@
-"""The doors of the simulator: what goes in, what comes out, and the sentences for what cannot."""
+"""Interface of the simulator: inputs, outputs, and messages for invalid ones."""
 
 import re
 
@@ -16,7 +16,7 @@ FIELDS = ("position", "quaternion", "velocity", "acceleration", "thrust")
 
 @EVERY_VEHICLE_AND_MODEL
 def test_every_vehicle_moves_in_every_model_it_has(name, model):
-    """A pool-free world with all its actuators at their ends for a second: it moves, and the state is finite."""
+    """With all actuators at their limits for a second in open water, it moves, and the state is finite."""
     simulator = Simulator(name, hydrodynamics=model)
     simulator.set_actuators(load(name).channel_limits[1])
     for _ in range(10):
@@ -27,7 +27,7 @@ def test_every_vehicle_moves_in_every_model_it_has(name, model):
 
 @ONE_VEHICLE_PER_MODEL
 def test_vehicles_of_one_world_move_as_they_would_alone(model):
-    """Two kinds of vehicle in one world and one water: each does bitwise what it does in a world of its own."""
+    """Two kinds of vehicle in one world and one water each move bit-identically to a world of their own."""
     names = ["finsrov", "bluerov2_heavy_morgan"] if model != "simplified" else ["finsrov", "finsrov_sim7"]
     states = random_states(np.random.default_rng(1), 2, speed=0.3)
     thrust = np.random.default_rng(2).uniform(-3, 3, (2, 8))
@@ -50,7 +50,7 @@ def test_vehicles_of_one_world_move_as_they_would_alone(model):
 
 
 def test_numpy_and_torch_see_the_simulators_own_memory():
-    """On a CPU, a view shows the next step and takes what is written to it; nothing is copied."""
+    """On a CPU, a view shows the next step, and values written to it take effect; nothing is copied."""
     simulator = Simulator("finsrov", worlds=3, substeps=2)
     for name in FIELDS:
         array, tensor = simulator.numpy(name), simulator.torch(name)
@@ -81,7 +81,7 @@ def test_a_reset_by_mask_restarts_the_motors_and_clocks_of_its_worlds_only():
         assert np.array_equal(simulator.numpy(name)[[0, 2]], before[name][[0, 2]])
         assert not simulator.numpy(name)[[1, 3]].any()
     assert simulator.state.steps.numpy().tolist() == [4, 0, 4, 0]
-    # The delay line is empty: 0.05 s of nothing, then 0.05 s of lag from zero.
+    # The delay line is empty: 0.05 s of zero thrust, then 0.05 s of lag from zero.
     simulator.step()
     fresh = Simulator("finsrov")
     fresh.set_thrust(np.full(8, 2.0))
@@ -102,7 +102,7 @@ def test_a_reset_by_mask_restarts_the_motors_and_clocks_of_its_worlds_only():
     ],
 )
 def test_a_parameter_acts_on_its_world_alone(field, factor):
-    """One world's parameter changed: that world moves as a simulator with it everywhere does, the others as before."""
+    """The world with the changed parameter moves as with it everywhere, the others as before."""
 
     def run(change):
         simulator = Simulator("finsrov", worlds=4)
@@ -124,7 +124,7 @@ def test_a_parameter_acts_on_its_world_alone(field, factor):
 
 
 def test_placing_restarts_the_same_run():
-    """place, run, place, run: the same bits twice, in water without random parts."""
+    """place, run, place, run gives the same bits twice, in water without random parts."""
     simulator = Simulator("finsrov", worlds=2)
     results = []
     for _ in range(2):
@@ -137,7 +137,7 @@ def test_placing_restarts_the_same_run():
 
 
 def test_a_step_that_changes_on_the_way_goes_on_with_the_motion():
-    """Half a second in steps of 10 ms and half a second of 5 ms end where a second of 5 ms does; clocks go on."""
+    """Half a second in steps of 10 ms and half in 5 ms end like a second of 5 ms; clocks continue."""
     simulators = [Simulator("bluerov2_heavy", control_step=h, substeps=1) for h in (0.01, 0.005)]
     for simulator, steps in zip(simulators, (50, 200), strict=True):
         simulator.place((0.0, 0.0, -5.0), velocity=(0.8, 0.3, -0.2, 0.2, 0.1, 0.5))
@@ -152,14 +152,14 @@ def test_a_step_that_changes_on_the_way_goes_on_with_the_motion():
 
 
 def test_a_quaternion_is_made_of_unit_length():
-    """(0, 0, 3, 4) is the turn of (0, 0, 0.6, 0.8)."""
+    """(0, 0, 3, 4) is the rotation of (0, 0, 0.6, 0.8)."""
     simulator = Simulator("finsrov")
     simulator.place(quaternion=(0.0, 0.0, 3.0, 4.0))
     assert simulator.numpy("quaternion")[0, 0] == pytest.approx([0.0, 0.0, 0.6, 0.8], abs=1e-7)
 
 
 def test_a_new_simulator_has_its_vehicles_in_the_water_at_rest():
-    """Level, at rest, in the middle of the pool's depth."""
+    """Vehicles are level, at rest, in the middle of the pool's depth."""
     simulator = Simulator("finsrov", worlds=2, pool=RectangularPool(depth=3.0))
     assert simulator.numpy("position")[0, 0].tolist() == [0.0, 0.0, -1.5]
     assert not simulator.numpy("velocity").any()
@@ -188,13 +188,13 @@ def test_an_unknown_field_of_the_state_is_refused_by_name():
 
 @pytest.mark.parametrize(("arguments", "sentence"), REFUSED)
 def test_a_simulator_that_cannot_be_is_refused_in_one_sentence(arguments, sentence):
-    """The error names what was given and what is available."""
+    """The error names the given value and the available ones."""
     with pytest.raises(SimulatorError, match=re.escape(sentence)):
         Simulator("finsrov", **arguments)
 
 
 def test_a_vehicle_without_the_model_or_without_a_file_is_refused():
-    """LAUV has no hull; no vehicle is called 'finsrow'; no vehicle at all."""
+    """LAUV has no hull, no vehicle is called 'finsrow', and no vehicle at all is refused."""
     with pytest.raises(
         (SimulatorError, VehicleError), match=r"no hydrodynamics 'simplified'; its file gives: calibrated"
     ):
@@ -209,7 +209,7 @@ def test_a_vehicle_without_the_model_or_without_a_file_is_refused():
 
 @pytest.mark.skipif(wp.is_cuda_available(), reason="this machine has CUDA")
 def test_cuda_is_refused_where_there_is_none():
-    """With the devices that there are."""
+    """The message lists the available devices."""
     with pytest.raises(SimulatorError, match="device 'cuda' is not available here; available: cpu"):
         Simulator("finsrov", device="cuda")
 
@@ -230,7 +230,7 @@ def test_cuda_is_refused_where_there_is_none():
     ],
 )
 def test_a_bad_thrust_command_is_refused_and_changes_nothing(force, sentence):
-    """Wrong length, wrong shape, NaN: the sentence says which, and the last command stands."""
+    """The message names wrong length, wrong shape or NaN, and the last command remains in effect."""
     simulator = Simulator("finsrov", worlds=2)
     simulator.set_thrust(np.ones(8))
     with pytest.raises(SimulatorError, match=re.escape(sentence)):
@@ -255,7 +255,7 @@ def test_a_bad_thrust_command_is_refused_and_changes_nothing(force, sentence):
     ],
 )
 def test_a_bad_place_is_refused(start, sentence):
-    """NaN, no attitude, a wrong shape."""
+    """NaN, an invalid attitude and a wrong shape are refused."""
     simulator = Simulator("finsrov", worlds=2)
     with pytest.raises(SimulatorError, match=re.escape(sentence)):
         simulator.place(**start)

@@ -1,4 +1,4 @@
-"""Vehicles in contact with a described world: presses, bounces, and no way through."""
+"""Vehicles in contact with a described world: presses, bounces, and no penetration."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ LEVEL = (0.0, 0.0, 0.0, 1.0)
 
 @pytest.fixture
 def world(tmp_path):
-    """A world of a few lines."""
+    """World of a few lines."""
 
     def make(text, name="site"):
         path = tmp_path / f"{name}.yaml"
@@ -33,12 +33,12 @@ def world(tmp_path):
 
 
 def centred(vehicle=FINSROV, above=0.0):
-    """Neutral, its centre of gravity on its origin and that of buoyancy on or above it [m]."""
+    """Return a neutral vehicle, its centre of gravity on its origin and that of buoyancy on or above it [m]."""
     return neutral(vehicle.replace({"body.center_of_gravity": [0.0] * 3}), above)
 
 
 def ball():
-    """Without damping too: kinetic energy is all there is."""
+    """Return a vehicle that has no damping either, so that all its energy is kinetic."""
     return centred(undamped(FINSROV, "calibrated"))
 
 
@@ -53,7 +53,7 @@ def kinetic(simulator, vehicle):
      "objects: {floor: {shape: box, position: [0, 0, -6.5], size: [8, 8, 1]}}"],
 )  # fmt: skip
 def test_a_heavy_vehicle_rests_on_the_floor_at_weight_over_stiffness(world, floor):
-    """Plane, heightfield and box alike: four corners each carry a quarter of the weight in water, k depth."""
+    """On plane, heightfield and box, four corners each carry a quarter of the weight in water, k depth."""
     net = 0.05
     vehicle = FINSROV.replace(
         {"body.displaced_volume": (1.0 - net) * FINSROV.body.mass / FINSROV.water.density}
@@ -63,14 +63,14 @@ def test_a_heavy_vehicle_rests_on_the_floor_at_weight_over_stiffness(world, floo
     for _ in range(150):
         simulator.step()
     depth = -6.0 + HALF[2] - simulator.numpy("position")[:, 0, 2]
-    # The centres of gravity and buoyancy are a little aside, which tilts it: the mean of the corners is at the middle.
+    # Offsets of the centres of gravity and buoyancy tilt it: the mean of the corners is at the middle.
     expected = net * vehicle.weight / (4.0 * 4000.0)
     assert depth == pytest.approx(np.full(2, expected), rel=0.02)
     assert simulator.solids.force.numpy()[:, 0] == pytest.approx(np.full(2, net * vehicle.weight), rel=1e-3)
 
 
 def thing(text):
-    """A world's only object."""
+    """Return the only object of a world."""
     return f"objects: {{thing: {{{text}}}}}"
 
 
@@ -88,7 +88,8 @@ FLOORS = {
 
 
 def write_hollow(path):
-    """A closed block whose top falls by 0.3 m to its middle line, as an STL of text; its convex hull would be level."""
+    """Write a closed block whose top falls by 0.3 m to its middle line, as text STL; its convex hull would be
+    level."""
     corners = {(a, y, b): np.array([2.0 * a, y, 0.6 * abs(a) * b - 0.3 * (1 - b)])
                for a in (-1, 0, 1) for y in (-2, 2) for b in (0, 1)}  # fmt: skip
     quads = [
@@ -107,7 +108,7 @@ def write_hollow(path):
 
 @pytest.mark.parametrize("floor", FLOORS)
 def test_a_vehicle_rests_where_a_rigid_body_rests(floor, world, tmp_path):
-    """Heavy by 5 %, let go above each solid of a drawn world: pose as MuJoCo's, whose contacts are hard.
+    """Released 5 % heavy above each solid of a drawn world, it reaches the pose of MuJoCo, whose contacts are hard.
 
     The spheres of the hull lie a tenth of the least half extent inside the faces, and penalties are a few millimetres.
     """
@@ -141,7 +142,7 @@ SHAPES = {
 
 
 def write_cube(path, half=0.4):
-    """A closed cube as an STL of text."""
+    """Write a closed cube as text STL."""
     lines = ["solid cube"]
     for axis in range(3):
         for side in (-1.0, 1.0):
@@ -161,9 +162,10 @@ def write_cube(path, half=0.4):
 @pytest.mark.slow
 @pytest.mark.parametrize("shape", [*SHAPES, "seabed"])
 def test_an_undamped_bounce_gives_back_the_energy_and_no_more(world, shape, tmp_path):
-    """32 vehicles at other attitudes meet a solid at 0.3 m/s: those that leave it have the energy they came with.
+    """32 vehicles at other attitudes meet a solid at 0.3 m/s: those that leave it have their initial energy.
 
-    To 1 % in the middle and 4 % at most: where a point slides over an edge the gradient jumps, which no step resolves.
+    The tolerance is 1 % in the median and 4 % at most: where a point slides over an edge the gradient jumps, which no
+    step resolves.
     """
     write_cube(tmp_path / "cube.stl")
     text = f"objects: {{thing: {SHAPES[shape]}}}" if shape in SHAPES else (
@@ -196,7 +198,7 @@ def test_an_undamped_bounce_gives_back_the_energy_and_no_more(world, shape, tmp_
 
 
 def test_a_press_on_a_ball_sinks_in_by_force_over_stiffness(world):
-    """A ball before the middle of the bow meets one sphere of the hull: centres are R + r - F/k apart."""
+    """A ball before the middle of the bow touches one sphere of the hull: centres are R + r - F/k apart."""
     vehicle, force = centred(above=0.05), 8.0
     simulator = Simulator(
         vehicle, worlds=1, world=world("objects: {ball: {shape: sphere, position: [1, 0, -5], radius: 0.3}}")
@@ -215,7 +217,7 @@ def test_a_press_on_a_ball_sinks_in_by_force_over_stiffness(world):
 
 
 def test_every_world_has_its_own_solids_and_a_draw_moves_them(world):
-    """Vehicles pushed along x stop at the faces of their own blocks; drawn anew, at the new ones."""
+    """Vehicles pushed along x stop at the faces of their own blocks and, after a redraw, at the new ones."""
     layout = WorldLayout(world(BLOCK[:-1] + ", vary: {position: [0.3, 0, 0]}}"), worlds=4)
     layout.draw(2)
     simulator = Simulator(centred(above=0.05), worlds=4, world=layout, threads=1)
@@ -231,7 +233,7 @@ def test_every_world_has_its_own_solids_and_a_draw_moves_them(world):
         assert np.ptp(face) > 0.1
         np.testing.assert_allclose(stops[-1], face + 16.0 / (4.0 * 4000.0), atol=1e-3)
     assert np.abs(stops[0] - stops[1]).max() > 0.05
-    # A solid that is put where a vehicle lies pushes it out at once.
+    # A solid that is placed on a vehicle pushes it out at once.
     layout._drawn[:] = 0.0
     layout._place(np.arange(4))
     simulator.place((0.75, 0.0, -5.0))
@@ -242,7 +244,7 @@ def test_every_world_has_its_own_solids_and_a_draw_moves_them(world):
 
 
 def test_a_basin_is_a_pool(world):
-    """A world that is a basin alone: bit by bit what the pool of its size does."""
+    """A world that contains only a basin is bit-identical to the pool of its size."""
     site = world("basin: {size: [4, 2, 1]}\ncontact: {stiffness: 3000, damping: 80, friction: 0.1}")
     pool = RectangularPool(length=4.0, width=2.0, depth=1.0, stiffness=3000.0, damping=80.0, friction=0.1)
     runs = []
@@ -262,7 +264,8 @@ def test_a_basin_is_a_pool(world):
 
 
 def test_boxes_around_a_vehicle_are_the_walls_of_a_pool(world):
-    """Slabs in place of a basin: the same forces on the same corners, so the same motion to the rounding of poses."""
+    """Slabs instead of a basin give the same forces on the same corners: equal motion to the rounding of
+    poses."""
     slabs = "objects:\n" + "\n".join(
         f"  {name}: {{shape: box, position: {position}, size: {size}}}"
         for name, position, size in (
@@ -285,9 +288,10 @@ def test_boxes_around_a_vehicle_are_the_walls_of_a_pool(world):
 @pytest.mark.parametrize("name", ["finsrov", "lauv"])
 @pytest.mark.slow
 def test_thin_solids_hold(world, name):
-    """A plate of 4 cm and, a wide vehicle, struts of 3 cm hold what comes at 1 m/s under full thrust.
+    """A plate of 4 cm and, for a wide vehicle, struts of 3 cm stop vehicles at 1 m/s under full thrust.
 
-    A torpedo gets between two struts: at 4 kN/m the spring there takes 12 J, less than it has. Its fins are left out.
+    A torpedo passes between two struts: at 4 kN/m the spring there absorbs 12 J, less than its energy. Its fins are left
+    out.
     """
     text = (
         "objects:\n  plate: {shape: box, position: [2.5, -20, -5], size: [0.04, 39, 7]}\n"
@@ -315,7 +319,8 @@ def test_thin_solids_hold(world, name):
 
 
 def test_worlds_that_touch_nothing_go_in_blocks_and_move_as_without_solids(world, monkeypatch):
-    """Far from a block: to rounding as in open water. Beside one that touches: bit by bit as beside a quiet one."""
+    """Far from a block, motion is as in open water, to rounding; beside one, contact of another world changes
+    no bit."""
     site = world(BLOCK)
 
     def run(start, **options):
@@ -339,7 +344,7 @@ def test_worlds_that_touch_nothing_go_in_blocks_and_move_as_without_solids(world
 
 
 def test_what_is_not_solid_is_not_there(world):
-    """Fish and lines on the floor may be passed through."""
+    """Vehicles pass through fish and lines on the floor."""
     site = world(BLOCK[:-1] + ", solid: false}")
     simulator = Simulator(neutral(FINSROV), worlds=1, world=site)
     simulator.place((0.9, 0.0, -5.0))
@@ -349,7 +354,7 @@ def test_what_is_not_solid_is_not_there(world):
 
 @pytest.mark.slow
 def test_the_step_with_solids_compiles_for_cuda(tmp_path):
-    """NVRTC, which needs no device, makes code (PTX) for a compute capability of 7.5."""
+    """NVRTC, which needs no device, compiles the step to PTX for compute capability 7.5."""
     wp.init()
     if wp.get_cuda_toolkit_version() is None:
         pytest.skip("this Warp has no CUDA compiler")

@@ -1,4 +1,5 @@
-"""No catalogue vehicle runs away at steps of 25 ms, turning fast under water, through the surface or in the air."""
+"""No catalogue vehicle diverges at steps of 25 ms, turning fast under water, through the surface or in the
+air."""
 
 import numpy as np
 import pytest
@@ -12,7 +13,8 @@ WORLDS = 96
 
 
 def fast_starts(vehicle, rng):
-    """A third of the worlds deep under water, at the surface and in the air; 3 m/s and 10 rad/s, any directions."""
+    """Return starts deep under water, at the surface and in the air, a third each; 3 m/s and 10 rad/s, any
+    directions."""
     length = max(vehicle.body.size)
     position = np.zeros((WORLDS, 3), np.float32)
     position[:, 2] = np.repeat([-20.0 * length, -0.2 * length, 2.0 * length], WORLDS // 3)
@@ -24,11 +26,11 @@ def fast_starts(vehicle, rng):
 @pytest.mark.slow
 @EVERY_VEHICLE_AND_MODEL
 def test_nothing_runs_away_from_a_fast_turn(name, model):
-    """From 3 m/s and 10 rad/s, 5 s in steps of 25 ms: all worlds go on, and energy is what weight and thrust can give.
+    """From 3 m/s and 10 rad/s, 5 s in steps of 25 ms, all worlds run, with energy that weight and thrust can supply.
 
-    In the free half of the worlds, errors never make as much energy as the greatest kinetic energy at the start: h |ω|
-    is 1/4, and damping would slow the stiffest axis fifty times in a substep. In the others, driven at 70 % of the
-    limits, speeds stay below 20 m/s and the fall. A hull more than eight times as long as it is wide falls through the
+    In the undriven half of the worlds, errors never add as much energy as the greatest kinetic energy at the start:
+    h |ω| is 1/4, and damping would slow the stiffest axis fifty times in a substep. In the others, driven at 70 % of the
+    limits, speeds stay below 20 m/s plus the fall. A hull more than eight times as long as it is wide falls through the
     surface within 25 ms, and is rolled by it: it has steps half as long.
     """
     vehicle = load(name)
@@ -62,8 +64,8 @@ def test_nothing_runs_away_from_a_fast_turn(name, model):
 def test_a_body_in_the_air_keeps_its_momentum():
     """Out of the water no added mass acts: the velocity falls by g t, and the angular momentum R I ω is constant.
 
-    3 rad/s about any axis for 1 s in steps of 25 ms. In the body's axes both turn at |ω|, and the midpoint rule's angle
-    is 5/12 (h |ω|)² |ω| t off.
+    3 rad/s about any axis for 1 s in steps of 25 ms. In body axes both turn at |ω|, and the midpoint rule's angle
+    error is 5/12 (h |ω|)² |ω| t.
     """
     vehicle, rate = load("finsrov"), 3.0
     rng = np.random.default_rng(1)
@@ -91,9 +93,9 @@ def test_a_body_in_the_air_keeps_its_momentum():
 
 
 def test_a_vehicle_put_half_into_a_wall_comes_out():
-    """With at most the energy of the springs that it lay in, four corners of 4000 N/m half a length deep, and no more.
+    """Its energy is at most that of the springs that it lay in: four corners of 4000 N/m half a length deep.
 
-    In the air it would leave with sqrt(2 E / m); the water takes from that.
+    In the air it would leave with sqrt(2 E / m); the water reduces this.
     """
     vehicle = load("finsrov")
     pool, rng = RectangularPool(), np.random.default_rng(2)

@@ -1,4 +1,4 @@
-"""Walls, floor and tether as the engine plays them."""
+"""Walls, floor and tether in the engine."""
 
 import numpy as np
 import pytest
@@ -12,13 +12,13 @@ POOL = RectangularPool(length=4.0, width=2.0, depth=1.0)
 
 
 def sinking(name, model, net=0.05):
-    """A vehicle 5 % heavier than its buoyancy."""
+    """Return a vehicle 5 % heavier than its buoyancy."""
     vehicle = load(name)
     return vehicle.replace({"body.displaced_volume": (1.0 - net) * vehicle.body.mass / vehicle.water.density})
 
 
 def corners(vehicle, position, q):
-    """World heights and places of the eight corners (..., 8, 3) of the envelope."""
+    """Return world heights and positions of the eight corners (..., 8, 3) of the envelope."""
     signs = np.array(np.meshgrid([1, -1], [1, -1], [1, -1])).T.reshape(-1, 3)
     return position[..., None, :] + np.einsum("...ij,cj->...ci", rotation(q), signs * 0.5 * vehicle.body.size)
 
@@ -27,7 +27,7 @@ def corners(vehicle, position, q):
 @ONE_VEHICLE_PER_MODEL
 @pytest.mark.parametrize("integrator", ["midpoint", "rk4"])
 def test_a_sinking_vehicle_comes_to_rest_on_the_floor(model, integrator):
-    """From any attitude: its energy, the springs included, never grows, and the floor ends carrying its net weight.
+    """From any attitude its energy, springs included, never grows, and the floor finally carries its net weight.
 
     The tolerance is 2 mm of its net weight: the floor's forces switch on and off within a step.
     """
@@ -55,12 +55,12 @@ def test_a_sinking_vehicle_comes_to_rest_on_the_floor(model, integrator):
 
 @pytest.mark.parametrize("way", [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, -1)])
 def test_walls_hold_against_full_thrust(way):
-    """Pushed with 20 N into each wall and the floor for 20 s: its corners go in by less than force/stiffness."""
+    """Pushed with 20 N into each wall and the floor for 20 s, corners penetrate by less than force/stiffness."""
     vehicle = load("finsrov")
     simulator = Simulator(vehicle, worlds=1, pool=POOL)
     simulator.place((0.0, 0.0, -0.5))
     for _ in range(200):
-        # The push stays along the wall's normal, at the centre of gravity, however the vehicle turns.
+        # The push stays along the wall's normal, at the centre of gravity, in any attitude.
         R = rotation(simulator.numpy("quaternion")[0, 0])
         force = 20.0 * R.T @ np.array(way, float)
         disturb(simulator, np.r_[force, np.cross(vehicle.body.center_of_gravity, force)])
@@ -74,9 +74,9 @@ def test_walls_hold_against_full_thrust(way):
 
 @ONE_VEHICLE_PER_MODEL
 def test_a_vehicle_stays_in_the_pool_at_full_random_thrust(model):
-    """A minute of full thrust, drawn anew each second: no corner goes further than its spring lets the fastest hit.
+    """In a minute of full thrust, redrawn each second, no corner penetrates farther than the fastest hit can.
 
-    ½ (m + m_a) v² = ½ k x², and what the thrusters hold it in with.
+    This is ½ (m + m_a) v² = ½ k x², plus the depth at which the thrusters hold it.
     """
     vehicle = load("finsrov")
     simulator = Simulator(vehicle, worlds=20, hydrodynamics=model, pool=POOL)
@@ -96,9 +96,9 @@ def test_a_vehicle_stays_in_the_pool_at_full_random_thrust(model):
 
 
 def test_tether_drag_enters_the_equation_of_motion():
-    """M Δnu_dot = the tether's wrench: with and without it, from the same state, in a step of 0.1 ns."""
+    """M Δnu_dot is the tether's wrench: with and without it, from the same state, in a step of 0.1 ns."""
     vehicle = load("finsrov")
-    vehicle = vehicle.replace({"thrusters.*.delay": 0.0})  # a delay line of 0.1 ns steps would be long
+    vehicle = vehicle.replace({"thrusters.*.delay": 0.0})  # a delay line of 0.1 ns steps would be too long
     line = TetherLine(anchor=(0.0, 0.0, 0.0), attachment=(-0.2, 0.0, 0.1), wet_weight=0.2)
     nu = np.array([0.3, 0.5, -0.2, 0.1, 0.0, 0.2])
     found = []

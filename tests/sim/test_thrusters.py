@@ -1,4 +1,4 @@
-"""From command to thrust: delay, dead zone, lag, slew limit and curve, as the engine plays them."""
+"""From command to thrust in the engine: delay, dead zone, lag, slew limit and curve."""
 
 import numpy as np
 import pytest
@@ -10,13 +10,14 @@ STEP = 0.1
 
 
 def motors(name="finsrov", **changes):
-    """A vehicle whose thrusters have no dead zone and no slew limit, with all their numbers alike where given."""
+    """Return a vehicle with thrusters without dead zone and slew limit; given numbers apply to all thrusters."""
     plain = {"dead_rpm_minus": 0.0, "dead_rpm_plus": 0.0, "slew": 1e6} | changes
     return load(name).replace({f"thrusters.*.{key}": value for key, value in plain.items()})
 
 
 def thrusts(vehicle, commands, substeps=10, **keywords):
-    """Thrust of every thruster (steps, n) after each control step, each with its own command (steps, n)."""
+    """Return the thrust of every thruster (steps, n) after each control step, each with its own command
+    (steps, n)."""
     simulator = Simulator(vehicle, control_step=STEP, substeps=substeps, **keywords)
     simulator.place(position=(0.0, 0.0, -100.0))
     rows = []
@@ -28,7 +29,8 @@ def thrusts(vehicle, commands, substeps=10, **keywords):
 
 
 def exact_lag(commands, delay, tau):
-    """The exact response of tau dx/dt = u(t - delay) - x at the ends of the control steps; u holds between commands."""
+    """Return the exact response of tau dx/dt = u(t - delay) - x at the ends of the control steps, with u held
+    between."""
     ends = STEP * np.arange(1, len(commands) + 1)
     steps = np.diff(commands, axis=0, prepend=0.0)
     response = np.zeros_like(commands)
@@ -41,7 +43,8 @@ def exact_lag(commands, delay, tau):
 @pytest.mark.parametrize("delay", [0.0, 0.05, 0.1, 0.23])
 @pytest.mark.parametrize("integrator", ["midpoint", "rk4"])
 def test_a_delayed_lag_is_exact_when_the_delay_fits_the_substeps(delay, integrator):
-    """Sums of F (1 - exp(-(t - delay)/T)) over 30 random commands, to float32; delays of 0 to 23 substeps."""
+    """Sums of F (1 - exp(-(t - delay)/T)) over 30 random commands match to float32; delays of 0 to 23
+    substeps."""
     vehicle = motors(time_constant=0.12, delay=delay)
     lower, upper = vehicle.force_limits
     commands = np.random.default_rng(1).uniform(lower, upper, (30, 8))
@@ -53,7 +56,8 @@ def test_a_delayed_lag_is_exact_when_the_delay_fits_the_substeps(delay, integrat
 
 @pytest.mark.parametrize("substeps", [2, 5, 20])
 def test_a_delay_inside_a_substep_is_met_to_second_order(substeps):
-    """A command that arrives within a substep acts as its mean over it: F (h/T)²/8 off at most, each time."""
+    """A command that arrives within a substep acts as its mean over it: the error is at most F (h/T)²/8 each
+    time."""
     vehicle = motors(time_constant=0.12, delay=0.0337)
     lower, upper = vehicle.force_limits
     commands = np.random.default_rng(2).uniform(lower, upper, (30, 8))
@@ -63,7 +67,7 @@ def test_a_delay_inside_a_substep_is_met_to_second_order(substeps):
 
 
 def test_forces_change_no_faster_than_the_slew_limit():
-    """From rest towards 5.5 N at 20 N/s: 2 N more each 0.1 s, until the lag alone is slower."""
+    """From rest towards 5.5 N at 20 N/s, thrust grows by 2 N each 0.1 s, until the lag alone is slower."""
     vehicle = motors(time_constant=0.02, delay=0.0, slew=20.0)
     found = thrusts(vehicle, np.full((10, 8), 5.5))
     assert found[:2] == pytest.approx(np.array([[2.0], [4.0]]) * np.ones(8), abs=1e-5)
@@ -72,9 +76,9 @@ def test_forces_change_no_faster_than_the_slew_limit():
 
 
 def test_small_commands_are_dead_and_large_ones_saturate():
-    """Below the thrust of the slowest speed nothing comes, beyond the range the limit, after 15 time constants.
+    """After 15 time constants, thrust is zero below that of the slowest speed, and at the limit beyond the range.
 
-    WarpAUV: its motors lag in speed and have a dead zone.
+    WarpAUV's motors lag in speed and have a dead zone.
     """
     vehicle = load("warpauv")
     lower, upper = vehicle.force_limits
@@ -96,7 +100,8 @@ def test_small_commands_are_dead_and_large_ones_saturate():
 
 @pytest.mark.parametrize("name", ["lauv", "warpauv", "rexrov"])
 def test_a_speed_lag_acts_on_the_propeller(name):
-    """domain: speed - ω follows exactly, thrust is c± ω|ω|: while ω has made a part a of its way, T has made a²."""
+    """domain: speed - ω follows exactly and thrust is c± ω|ω|: when ω has completed a fraction a, T has
+    completed a²."""
     vehicle = motors(name, time_constant=0.15, delay=0.1)
     n = len(vehicle.thrusters)
     lower, upper = vehicle.force_limits
@@ -112,7 +117,7 @@ def test_a_speed_lag_acts_on_the_propeller(name):
 
 
 def test_a_gain_scales_what_is_delivered_and_zero_is_a_dead_thruster():
-    """plant.gain by world and thruster: half, none, and one and a half of the nominal thrust."""
+    """plant.gain by world and thruster gives half, none, and one and a half of the nominal thrust."""
     vehicle = motors(time_constant=0.02, delay=0.0)
     simulator = Simulator(vehicle, worlds=2, control_step=STEP, substeps=10)
     gain = np.ones((2, 1, 8), np.float32)
@@ -127,9 +132,10 @@ def test_a_gain_scales_what_is_delivered_and_zero_is_a_dead_thruster():
 
 @pytest.mark.parametrize("substeps", [1, 4])
 def test_the_mean_thrust_of_a_step_is_exact(substeps):
-    """From rest: M nu = B ∫ F (1 - exp(-t/T)) dt, whatever the step, for motors faster and slower than it.
+    """From rest M nu = B ∫ F (1 - exp(-t/T)) dt for any step, for motors faster and slower than it.
 
-    And for one that only slews, at 0.1 N/s from 0: ∫ 0.1 t dt. What 0.02 N turns and damps in 0.1 s is 1e-4 of it.
+    For a motor that only slews, at 0.1 N/s from 0, it is ∫ 0.1 t dt. Rotation and damping by 0.02 N in 0.1 s are 1e-4
+    of it.
     """
     vehicle = weightless(load("finsrov").replace({"water.gravity": 1e-6}), "simplified")
     chosen = int(np.argmax(np.abs(vehicle.thruster_matrix()[0])))
@@ -151,7 +157,7 @@ def test_the_mean_thrust_of_a_step_is_exact(substeps):
 
 
 def test_thrust_reaches_the_body_through_the_thruster_matrix():
-    """From rest, in a step of 0.1 µs: M nu_dot = B f with each thruster alone, its motor following at once."""
+    """From rest, in a step of 0.1 µs, M nu_dot = B f with each thruster alone and its motor without lag."""
     vehicle = motors(time_constant=1e-9, delay=0.0, slew=1e12).replace(
         {"water.gravity": 1e-6}  # no weight, no buoyancy: only thrust
     )

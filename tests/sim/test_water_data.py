@@ -1,4 +1,4 @@
-"""Water as data: profiles over depth and time, sea states, water files, and what is drawn of them."""
+"""Water as data: profiles over depth and time, sea states, water files, and draws from them."""
 
 import json
 import math
@@ -55,7 +55,8 @@ def table(tmp_path):
 
 
 def test_a_profile_is_linear_between_its_rows_and_constant_beyond_them(table):
-    """Velocity, its gradient and its rate, beside NumPy's interpolation, at depths and times within and outside."""
+    """Velocity, its gradient and its rate equal NumPy's interpolation, at depths and times within and
+    outside."""
     arrays = arrays_of(Water(current=table))
     depths, times = np.array([0.0, 5.0, 20.0]), np.array([0.0, 600.0])
     values = np.loadtxt(table, delimiter=",", skiprows=1)[:, 2:].reshape(2, 3, 3)
@@ -83,7 +84,8 @@ def test_a_profile_is_linear_between_its_rows_and_constant_beyond_them(table):
 
 
 def test_a_still_vehicle_is_carried_as_the_water_at_its_depth(tmp_path):
-    """After ten minutes it moves as the profile at its depth, to a hundredth; a vehicle above it moves otherwise."""
+    """After ten minutes it has moved with the profile at its depth, to a hundredth; a vehicle above moves
+    differently."""
     (tmp_path / "p.csv").write_text("depth;east;north\n0;0,3;0\n10;0,1;0,2\n", encoding="utf-8")
     simulator = Simulator("finsrov", worlds=2, water=Water(current=tmp_path / "p.csv", depth=30.0))
     simulator.place(position=[[[0.0, 0.0, -2.0]], [[0.0, 0.0, -8.0]]])
@@ -122,7 +124,8 @@ def test_a_table_with_an_error_is_refused_by_line(name, tmp_path):
 
 @pytest.mark.parametrize(("spectrum", "peak"), [("jonswap", 3.3), ("pierson-moskowitz", 1.0)])
 def test_a_sea_has_the_energy_the_shape_and_the_directions_of_its_spectrum(spectrum, peak):
-    """H² / 16 exactly; the cumulative energy of 200 components against the integral of the published spectrum."""
+    """The energy is H² / 16 exactly; the cumulative energy of 200 components follows the published spectrum's
+    integral."""
     sea = SeaState(
         spectrum=spectrum, height=0.8, period=5.0, heading=0.7, spread=0.4, components=200, seed=3, peak=peak
     )
@@ -136,7 +139,7 @@ def test_a_sea_has_the_energy_the_shape_and_the_directions_of_its_spectrum(spect
         sigma = np.where(w <= wp_, 0.07, 0.09)
         density *= 3.3 ** np.exp(-((w / wp_ - 1) ** 2) / (2 * sigma**2))
     inside = (w > 0.4 * wp_) & (w < 4.0 * wp_)
-    assert density[inside].sum() / density.sum() > 0.994  # what the cut leaves out
+    assert density[inside].sum() / density.sum() > 0.994  # energy beyond the cut
     energy = np.cumsum(density * inside)
     np.testing.assert_allclose(
         np.interp(omega, w, energy / energy[-1]), (np.arange(200) + 0.5) / 200, atol=0.004
@@ -148,7 +151,8 @@ def test_a_sea_has_the_energy_the_shape_and_the_directions_of_its_spectrum(spect
 
 
 def test_the_surface_of_a_sea_has_its_significant_height():
-    """Four standard deviations of the elevation over 20 minutes, within what 24 components leave to chance."""
+    """It is four standard deviations of the elevation over 20 minutes, within the statistical error of 24
+    components."""
     arrays = arrays_of(
         Water(waves=SeaState(spectrum="jonswap", height=0.5, period=4.0, spread=0.3), depth=20.0)
     )

@@ -140,14 +140,14 @@ def test_the_hull_meets_the_things_of_the_world(wall):
 
 
 def test_a_team_has_no_world():
-    """One vehicle sees one world."""
+    """A world supports a single vehicle only."""
     with pytest.raises(PlantSpecError, match="--world out"):
         run(SiteChoice(world="dock"), Ends(), team="finsrov,finsrov")
 
 
 @pytest.mark.slow
 def test_a_pool_without_a_world_leaves_newton_alone():
-    """Its start stays as quick as it was."""
+    """Starting a pool without a world does not import Newton."""
     script = (
         "import sys; from finssim.pool.run import make_plan; "
         "make_plan('finsrov', '1', 'nominal', camera='none'); sys.exit('newton' in sys.modules)"

@@ -1,4 +1,4 @@
-"""Each test process talks on a ROS domain of its own, over the loopback alone."""
+"""Each test process uses its own ROS domain, over the loopback only."""
 
 import importlib.util
 import os
@@ -19,8 +19,8 @@ WIRE = (
     "wire_settings",
     "wire_types",
 )
-"""Tests that need it."""
+"""Tests that need the wire."""
 
-# Cyclone's wheels end at Python 3.11; elsewhere the wire is that of a sourced ROS 2.
+# Cyclone has no wheels beyond Python 3.11; elsewhere the tests use a sourced ROS 2.
 if importlib.util.find_spec("cyclonedds") is None:
     collect_ignore = [f"test_{name}.py" for name in WIRE]

@@ -1,4 +1,4 @@
-"""Nodes need an rclpy; where Cyclone has no wheel, and no ROS 2 is sourced, there is none."""
+"""Nodes need an rclpy; without a wheel of Cyclone and without a sourced ROS 2 their tests are skipped."""
 
 import fcntl
 import importlib.util
@@ -13,7 +13,7 @@ if importlib.util.find_spec("cyclonedds") is None:
 
 @pytest.fixture(scope="module")
 def alone():
-    """The only graph in real time: two at once are more than two cores can play."""
+    """Lock for the only graph in real time: two at once would overload two cores."""
     with (Path(tempfile.gettempdir()) / "finssim-real-time-graph.lock").open("w") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         yield

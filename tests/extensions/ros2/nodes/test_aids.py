@@ -1,5 +1,5 @@
 # ruff: noqa: E402 - rclpy can be imported once a backend is active
-"""Fixes by wire, Doppler log and compass: from the motor controller to topics and odometry, without a camera."""
+"""Position fixes, DVL and compass: from the motor controller to topics and odometry, without a camera."""
 
 from types import SimpleNamespace
 
@@ -26,7 +26,7 @@ HEARD = ("positioning", "dvl", "compass", "odometry", "estimator")
 
 @pytest.fixture
 def sea():
-    """One vehicle, its bridge and its estimator."""
+    """One vehicle with its bridge and its estimator."""
     made = Sea((3.0, -2.0, -4.0))
     address = f"robot:='udp://127.0.0.1:{made.end.address[1]}'"
     options = [
@@ -62,7 +62,7 @@ def sea():
 
 @pytest.mark.slow
 def test_instruments_become_topics_and_topics_a_place(sea):
-    """Motion capture at 50 Hz and 2 mm, 20 ms late, a log at 8 Hz: the odometry is within 2 cm of the truth."""
+    """With motion capture (50 Hz, 2 mm, 20 ms late) and a DVL at 8 Hz, odometry is within 2 cm of the truth."""
     heard = sea.heard
     assert sea.until(lambda: any(m.ready for m in heard["estimator"]) and len(heard["dvl"]) > 10)
     count = len(heard["odometry"])
