@@ -1,4 +1,4 @@
-"""Drag of a taut tether against the integral along it."""
+"""Drag of a taut tether compared with the integral along it."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,10 @@ def wide(x):
 
 
 def test_the_vehicle_carries_its_share_of_the_integral():
-    """F = -∫ ½ ρ C d |v_n s| v_n s · s L ds - ½ w L k at the attachment, by moments about the anchor; random states."""
+    """In random states F at the attachment, from moments about the anchor, is the integral of drag and weight.
+
+    F = -∫ ½ ρ C d |v_n s| v_n s · s L ds - ½ w L k.
+    """
     rng = np.random.default_rng(8)
     for q in random_attitudes(rng, 40):
         position, nu = rng.uniform([-3, -3, -5], [3, 3, -1]), rng.normal(size=6)

@@ -1,4 +1,4 @@
-"""Currents and waves: the orbital motion is that of a potential, with its own surface and its own acceleration."""
+"""Currents and waves: orbital motion derives from a potential, with its own surface and its own acceleration."""
 
 import math
 
@@ -37,12 +37,12 @@ def flow_kernel(
 
 
 def arrays_of(water, worlds=1):
-    """The engine's arrays for a `Water`."""
+    """Return the engine's arrays for a `Water`."""
     return water.arrays(worlds, 1000.0, G, wp.get_device("cpu"))
 
 
 def flow_here(water, position, t, t_step=0.0):
-    """The engine's flow at points (n, 3), a dictionary of the fields of `Flow` in float64."""
+    """Return the engine's flow at points (n, 3), a dictionary of the fields of `Flow` in float64."""
     arrays = arrays_of(water) if isinstance(water, Water) else water
     points = wp.array(np.asarray(position, np.float32), dtype=wp.vec3, device="cpu")
     out = wp.zeros(len(points), dtype=Flow, device="cpu")
@@ -52,31 +52,31 @@ def flow_here(water, position, t, t_step=0.0):
 
 
 def in_space(water, name, position, t, d, axes=3):
-    """Central differences of a field over ±d along the world axes, on a new last axis."""
+    """Return central differences of a field over ±d along the world axes, on a new last axis."""
     ends = [[flow_here(water, position + s * d * a, t)[name] for s in (1, -1)] for a in np.eye(3)[:axes]]
     return np.stack([(ahead - behind) / (2 * d) for ahead, behind in ends], axis=-1)
 
 
 def in_time(water, name, position, t, d):
-    """Central difference of a field over ±d seconds."""
+    """Return the central difference of a field over ±d seconds."""
     return (flow_here(water, position, t + d)[name] - flow_here(water, position, t - d)[name]) / (2 * d)
 
 
 def places(n=500, seed=0, top=0.2):
-    """Points in and a little above the water."""
+    """Return points in and slightly above the water."""
     rng = np.random.default_rng(seed)
     return rng.uniform([-3, -3, -1.4], [3, 3, top], (n, 3)).astype(np.float32)
 
 
 # The shorter wave has the largest derivatives; together A ω < 0.45 m/s.
 K, OMEGA, SPEED = 2 * np.pi / 1.2, float(dispersion(2 * np.pi / 1.2, 1.5, G)), 0.45
-D = 5e-3  # of a central difference [m] or [s]: remainder (k d)²/6 of the derivative
+D = 5e-3  # step of a central difference [m] or [s]: remainder (k d)²/6 of the derivative
 ROUNDING = 3e-7 / D
 
 
 @pytest.mark.parametrize("depth", [0.2, 1.0, 30.0, math.inf])
 def test_dispersion_is_solved(depth):
-    """ω² = g k tanh(k h), and the wave number that solves it is found back to 1e-12."""
+    """ω² = g k tanh(k h), and its wave number is recovered to 1e-12."""
     k = 2.0 * np.pi / np.geomspace(0.1, 30.0, 40)
     omega = dispersion(k, depth, G)
     assert omega**2 == pytest.approx(G * k * np.tanh(k * min(depth, 1e6)), rel=1e-12)
@@ -85,14 +85,15 @@ def test_dispersion_is_solved(depth):
 
 
 def test_long_waves_travel_at_the_shallow_speed_and_short_ones_at_the_deep():
-    """c = ω/k tends to sqrt(g h), and to sqrt(g/k): k h = 0.01 and k h = 10."""
+    """c = ω/k tends to sqrt(g h) and to sqrt(g/k): k h = 0.01 and k h = 10."""
     assert dispersion(0.01, 1.0, G) / 0.01 == pytest.approx(math.sqrt(G), rel=1e-4)
     assert dispersion(10.0, 1.0, G) / 10.0 == pytest.approx(math.sqrt(G / 10.0), rel=1e-8)
 
 
 @pytest.mark.parametrize("t", [0.0, 7.3])
 def test_flow_agrees_with_the_potential(t):
-    """Velocity, acceleration, gradient, elevation and normal of `flow_at` in 500 places, to float32 phases."""
+    """Velocity, acceleration, gradient, elevation and normal of `flow_at` agree at 500 points, to float32
+    phases."""
     position = places()
     found, expected = flow_here(SEA, position, t), flow(SEA, G, position, t)
     for name, value in found.items():
@@ -116,7 +117,7 @@ def test_orbital_motion_has_no_curl_and_its_gradient_is_its_derivative():
 
 
 def test_acceleration_is_the_rate_of_the_velocity_in_place():
-    """∂v/∂t by central differences."""
+    """The acceleration is ∂v/∂t, by central differences."""
     position = places()
     found = flow_here(SEA, position, 2.0)["acceleration"]
     rate = in_time(SEA, "velocity", position, 2.0, D)
@@ -124,7 +125,7 @@ def test_acceleration_is_the_rate_of_the_velocity_in_place():
 
 
 def test_the_surface_moves_with_the_water_and_tilts_with_its_slope():
-    """∂η/∂t = w at z = 0 (kinematic condition, first order), and the normal is that of the slope of η."""
+    """∂η/∂t = w at z = 0 (kinematic condition, first order), and the normal follows the slope of η."""
     waves, position = Water(waves=SEA.waves, depth=SEA.depth), places()
     position[:, 2] = 0.0
     here = flow_here(waves, position, 1.0)
@@ -136,7 +137,7 @@ def test_the_surface_moves_with_the_water_and_tilts_with_its_slope():
 
 
 def test_water_does_not_pass_through_the_bottom():
-    """w = 0 at z = -h, however long the wave."""
+    """w = 0 at z = -h for any wavelength."""
     bottom = places()
     bottom[:, 2] = -SEA.depth
     assert flow_here(SEA, bottom, 3.0)["velocity"][:, 2] == pytest.approx(0.0, abs=1e-7)
@@ -150,9 +151,9 @@ def test_a_sheared_current_changes_with_depth_alone():
 
 
 def test_drift_has_its_standard_deviation_and_correlation_time():
-    """A Gauss-Markov current: after 5 correlation times std = σ (1 ± 4/sqrt(2n)), and exp(-t/T) of it is left after t.
+    """A Gauss-Markov current has std σ (1 ± 4/sqrt(2n)) after 5 correlation times, and correlation exp(-t/T).
 
-    20 000 independent worlds: the sampling error of a standard deviation is σ/sqrt(2n), of a correlation 1/sqrt(n).
+    With 20 000 independent worlds the sampling error of a standard deviation is σ/sqrt(2n), of a correlation 1/sqrt(n).
     """
     n, T, step, std = 20_000, 2.0, 0.5, np.array([0.1, 0.05, 0.02])
     water = arrays_of(Water(drift_std=tuple(std), drift_time=T), n)
@@ -174,7 +175,7 @@ def test_drift_has_its_standard_deviation_and_correlation_time():
 
 
 def test_drift_is_continuous_between_commands():
-    """The velocity at the end of a control step is the one at the start of the next: the rate is its slope."""
+    """The velocity at the end of a control step is that at the start of the next: the rate is its slope."""
     water = arrays_of(Water(drift_std=(0.1, 0.1, 0.1), drift_time=5.0))
     episode, steps = wp.zeros(1, dtype=int, device="cpu"), wp.zeros(1, dtype=int, device="cpu")
     point, end = [[0.0, 0.0, -0.5]], None
@@ -202,7 +203,7 @@ def test_waves_without_a_depth_are_those_of_deep_water():
 
 
 def test_a_pool_gives_its_depth_to_water_that_states_none():
-    """ω² = g k tanh(k h) with h of the pool; a stated depth stays."""
+    """ω² = g k tanh(k h) with h of the pool; a stated depth is kept."""
     wave, k = Wave(amplitude=0.02, wavelength=3.0), 2.0 * math.pi / 3.0
     for pool, depth, h in ((0.8, None, 0.8), (0.8, 1.5, 1.5)):
         simulator = Simulator(
@@ -229,6 +230,6 @@ def test_a_pool_gives_its_depth_to_water_that_states_none():
     ],
 )
 def test_water_that_cannot_be_is_refused(make, sentence):
-    """Breaking waves, no depth, numbers that are not finite: one sentence each."""
+    """Breaking waves, an invalid depth and non-finite numbers are refused in one sentence each."""
     with pytest.raises(SurroundingsError, match=sentence):
         make()

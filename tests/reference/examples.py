@@ -1,4 +1,4 @@
-"""Examples as modules, each loaded once: what they register is registered once."""
+"""Examples as modules, each loaded once, so that their registrations are made once."""
 
 import importlib.util
 import sys

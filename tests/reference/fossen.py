@@ -8,7 +8,7 @@ import numpy as np
 from reference.gz_sim import Origin
 
 F = np.array([1.0, -1.0, -1.0, 1.0, -1.0, -1.0])
-"""From forward, left, up to forward, right, down, and back."""
+"""Signs that convert forward, left, up to forward, right, down, and back."""
 
 
 def S(a):
@@ -16,7 +16,7 @@ def S(a):
 
 
 def coriolis(M, nu):
-    """C(nu) of Fossen 2021, eq. 3.60."""
+    """Return C(nu) of Fossen 2021, eq. 3.60."""
     C, a = np.zeros((6, 6)), M @ nu
     C[:3, 3:] = C[3:, :3] = -S(a[:3])
     C[3:, 3:] = -S(a[3:])
@@ -39,10 +39,11 @@ class Fossen(Origin):
         return (self.D + self.Dn * np.abs(nu)) @ nu
 
     def rate(self, R, nu, tau):
-        """Acceleration of many states, x forward, y left, z up: rotation (n, 3, 3), velocity and wrench (n, 6)."""
+        """Return the acceleration of many states, x forward, y left, z up: rotation (n, 3, 3), velocity and
+        wrench (n, 6)."""
         out, inverse = [], np.linalg.inv(self.M_RB + self.M_A)
         for turn, v, push in zip(R, nu * F, tau * F, strict=True):
-            down = np.array([-turn[2, 0], turn[2, 1], turn[2, 2]])  # the world's, in body axes with z down
+            down = np.array([-turn[2, 0], turn[2, 1], turn[2, 2]])  # the world's z axis, in body axes with z down
             total = push + np.concatenate([(self.W - self.B) * down, self.arm @ down]) - self.drag(v)
             total -= (coriolis(self.M_RB, v) + self.added_coriolis(v)) @ v
             out.append(inverse @ total * F)

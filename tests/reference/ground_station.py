@@ -16,7 +16,7 @@ DEEP = SPEC.model_copy(
         "firmware": SPEC.firmware.model_copy(update={"aiding_delay": 0.2}),
     }
 )
-"""A basin 5 m deep, with an autopilot that has a position soon."""
+"""Basin 5 m deep, with an autopilot that soon has a position."""
 ARM, MODE, INTERVAL, REQUEST, REBOOT = 400, 176, 511, 512, 246
 NEUTRAL = (0, 0, 500, 0)
 """x, y, z, r of MANUAL_CONTROL."""
@@ -24,7 +24,7 @@ ACCEPTED = 0
 
 
 class Ground:
-    """A ground station in lock-step with a pool, that beats and may steer."""
+    """Ground station in lock-step with a pool that sends heartbeats and may steer."""
 
     def __init__(
         self, *, system=255, start=(0.0, 0.0, -2.0), yaw=0.0, attitude=None, vehicle=HEAVY, spec=DEEP
@@ -47,7 +47,7 @@ class Ground:
         return data
 
     def run(self, duration, *messages):
-        """Messages that came meanwhile; the given ones go out first."""
+        """Send the given messages, and return the messages received during this time."""
         out, queue, end = [], [self.pack(m) for m in messages], self.pool.time + duration
         while self.pool.time < end - 1e-9:
             if self.beats and self.pool.time >= self.sent:
@@ -72,7 +72,7 @@ class Ground:
         return out
 
     def command(self, number, *values, wait=0.15):
-        """Result of a command."""
+        """Return the result of a command."""
         values = [*values, *[0.0] * (7 - len(values))]
         out = self.run(wait, mavlink.MAVLink_command_long_message(1, 1, number, 0, *values))
         (ack,) = [m for m in out if m.get_type() == "COMMAND_ACK"]
@@ -83,19 +83,19 @@ class Ground:
         return [m.text for m in out if m.get_type() == "STATUSTEXT"]
 
     def set(self, **values):
-        """Store parameters; their values as answered."""
+        """Store parameters and return their answered values."""
         out = []
         for name, value in values.items():
             out += self.run(0.1, mavlink.MAVLink_param_set_message(1, 1, name.encode(), value, 9))
         return {m.param_id: m.param_value for m in out if m.get_type() == "PARAM_VALUE"}
 
     def armed(self, mode=MANUAL, gain=1.0):
-        """Itself, armed and ready to be steered."""
+        """Return the ground station, armed and ready to steer."""
         self.set(JS_GAIN_DEFAULT=gain)
         self.pool.reboot()
         self.axes = NEUTRAL
         self.run(3.0)
-        self.set(BARO1_GND_PRESS=101325.0)  # the restart under water calibrated it there
+        self.set(BARO1_GND_PRESS=101325.0)  # the restart under water calibrated the pressure sensor there
         self.run(2.0)
         assert self.command(MODE, 1, mode) == ACCEPTED
         assert self.command(ARM, 1) == ACCEPTED and self.firmware.armed

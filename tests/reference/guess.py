@@ -1,11 +1,11 @@
-"""Tasks whose best action, or whose value, is known.
+"""Tasks with a known best action or a known value.
 
-Guess has one step, and its best action depends on what is observed.
+Guess has one step, and its best action depends on the observation.
 
-An agent sees a sign s, +1 or -1, drawn anew (agents of a world: +1 for the first, -1 for the second), and is paid
+An agent observes a sign s, +1 or -1, drawn anew (agents of a world: +1 for the first, -1 for the second), and is paid
 r = 1 - mean((a - s c)²) for action a, with c = 0.5 in every component. The best mean action is s c, and pays 1.
 
-Steady pays 1 for ever: its value is 1 / (1 - discount) everywhere, if an end by time is none.
+Steady pays 1 forever: its value is 1 / (1 - discount) everywhere, if an end by time does not count as an end.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from finssim.tasks.arrays import TaskArrays
 from finssim.tasks.terms import End, RewardTerm, Terms, each_step, place_at_rest
 
 BEST = 0.5
-"""c."""
+"""Best action's magnitude c."""
 
 
 @wp.func
@@ -54,7 +54,7 @@ def draw(state: State, arrays: TaskArrays, key: int, w: int):
 
 @dataclass(frozen=True, kw_only=True)
 class Guess(Task):
-    """One agent."""
+    """Task of one agent."""
 
     name: str = "guess"
     observation: tuple[ObservationPart, ...] = (ObservationPart("sign", 1, "1", clip=1.0, term=sign),)
@@ -66,14 +66,14 @@ class Guess(Task):
         return Terms(start=draw, rewards=(RewardTerm("guess", guessed, 1.0),), ends=(End("over", over),))
 
     def metrics(self, arrays: TaskArrays) -> dict[str, Any]:
-        """Success: paid at least 0.9."""
+        """Return success: a reward of at least 0.9."""
         measured = super().metrics(arrays)
         return {**measured, "success": np.where(measured["return"] >= 0.9, 1.0, 0.0)}
 
 
 @dataclass(frozen=True, kw_only=True)
 class GuessTogether(Guess):
-    """Two agents."""
+    """Task of two agents."""
 
     name: str = "guess_together"
     agents = ("first", "second")
@@ -81,7 +81,7 @@ class GuessTogether(Guess):
 
 @dataclass(frozen=True, kw_only=True)
 class Steady(Guess):
-    """Pays 1 in every step, whatever is done; time ends an episode after five steps, and nothing else does."""
+    """Task that pays 1 in every step for any action; only time ends an episode, after five steps."""
 
     name: str = "steady"
     time_limit: float = 0.5
@@ -92,7 +92,7 @@ class Steady(Guess):
 
 @dataclass(frozen=True, kw_only=True)
 class SteadyTogether(Steady):
-    """Two agents."""
+    """Task of two agents."""
 
     name: str = "steady_together"
     agents = ("first", "second")

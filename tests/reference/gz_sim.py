@@ -25,7 +25,7 @@ class Model:
     coefficients: dict
     """Word of the plugin Hydrodynamics -> number."""
     thrusters: list
-    """Pose (6,), axis (3,) and thrust coefficient of each."""
+    """Pose (6,), axis (3,) and thrust coefficient of each thruster."""
     prop: tuple = (0.002, (0.001, 0.001, 0.001))
     """Mass and inertia of a propeller's link."""
     diameter: float = 0.1
@@ -84,7 +84,7 @@ EXPLICIT = replace(
     coefficients=TETHYS.coefficients | {"xDotU": -4.876161, "yDotV": -126.324739, "zDotW": -126.324739, "kDotP": 0.0,
                                         "mDotQ": -33.46, "nDotR": -33.46},
 )  # fmt: skip
-"""The same with the added mass in the plugin, as the files have it."""
+"""The same vehicle with the added mass in the plugin, as in the files."""
 
 
 def element(parent, tag, value=None, **attributes):
@@ -134,7 +134,7 @@ def plugin(model, kind, **words):
 
 
 def tree(m):
-    """The `sdf` element of a model, and its `model`."""
+    """Return the `sdf` element of a model, and its `model`."""
     root = Element("sdf", version="1.9")
     world = element(root, "world", name="water")
     element(world, "gravity", (0, 0, -m.gravity))
@@ -167,7 +167,7 @@ def write(path, m):
 
 
 def euler(roll, pitch, yaw):
-    """Rz(yaw) Ry(pitch) Rx(roll)."""
+    """Return Rz(yaw) Ry(pitch) Rx(roll)."""
     (cr, cp, cy), (sr, sp, sy) = np.cos([roll, pitch, yaw]), np.sin([roll, pitch, yaw])
     z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
     y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
@@ -207,14 +207,15 @@ class Origin:
                     self.absolute[i, j, k] = m.coefficients.get(f"{force}{first}abs{second}", 0.0)
 
     def rate(self, R, nu, tau):
-        """Acceleration of many states: rotation body to world (n, 3, 3), velocity (n, 6), wrench (n, 6)."""
+        """Return the acceleration of many states: rotation body to world (n, 3, 3), velocity (n, 6), wrench
+        (n, 6)."""
 
         def momentum_wrench(a):
             lin = np.cross(a[:, :3], nu[:, 3:])
             return np.hstack([lin, np.cross(a[:, :3], nu[:, :3]) + np.cross(a[:, 3:], nu[:, 3:])])
 
         up = R[:, 2, :]  # the world's z in body axes
-        # The engine's own added mass follows Fossen; the plugin applies C(Ma, nu) nu with the other sign.
+        # The engine's own added mass follows Fossen; the plugin applies C(Ma, nu) nu with the opposite sign.
         wrench = (
             tau
             + momentum_wrench(nu @ (self.rigid + self.implicit).T)
@@ -228,7 +229,8 @@ class Origin:
         return wrench @ np.linalg.inv(self.rigid + self.implicit - self.Ma).T
 
     def run(self, R, nu, tau, duration, step=0.01):
-        """Rotations (t, n, 3, 3) and velocities (t, n, 6) at every step, by the classical Runge-Kutta method."""
+        """Return rotations (t, n, 3, 3) and velocities (t, n, 6) at every step, by the classical Runge-Kutta
+        method."""
 
         def slope(R, nu):
             spin = np.zeros_like(R)

@@ -1,4 +1,4 @@
-"""A controller holds the published setpoints in a plant of `tests/agents/conftest.py`, and how long it takes."""
+"""Station keeping at the published setpoints in a plant of `tests/agents/conftest.py`, and its settling time."""
 
 import math
 
@@ -27,7 +27,10 @@ def at_rest(position, quaternion, nu=None):
 
 
 def run(pid, plant, goal, seconds, noise=None):
-    """Errors over time: distance on each axis [m], heading [rad], tilt [rad], (steps, worlds, 5); and the memory."""
+    """Return errors over time and the memory.
+
+    Errors are distance on each axis [m], heading [rad] and tilt [rad], (steps, worlds, 5).
+    """
     memory, log = pid.reset(len(plant.p)), []
     for _ in range(round(seconds / pid.period)):
         measured = plant.measured if noise is None else noise(plant.measured)
@@ -41,7 +44,8 @@ def run(pid, plant, goal, seconds, noise=None):
 
 
 def settling_time(log, period, hold=10.0):
-    """When each world first stays within 0.10 m per axis and 10 degrees for `hold` seconds; infinite if never."""
+    """Return when each world first stays within 0.10 m per axis and 10 degrees for `hold` seconds; infinite
+    if never."""
     inside = (np.abs(log[..., :3]) <= 0.10).all(-1) & (np.abs(log[..., 3]) <= math.radians(10.0))
     n = round(hold / period)
     held = np.lib.stride_tricks.sliding_window_view(inside, n, axis=0).all(-1)

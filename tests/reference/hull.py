@@ -1,15 +1,15 @@
-"""Drag and displacement of a triangle mesh cut by a plane: corners sorted by height, the dry tip taken off."""
+"""Drag and displacement of a triangle mesh cut by a plane: corners sorted by height, the dry tip removed."""
 
 import numpy as np
 
 
 def wet_triangles(corners, normal, height):
-    """Area and centroid of the part of each triangle below a plane.
+    """Return area and centroid of the part of each triangle below a plane.
 
     Args:
-        corners: (m, 3, 3), body frame.
+        corners: Corners (m, 3, 3), body frame.
         normal: Upward unit normal of the plane, body frame (n, 3).
-        height: Of the body origin above the plane (n,).
+        height: Height of the body origin above the plane (n,).
 
     Returns:
         Areas (n, m) and centroids (n, m, 3), body frame.
@@ -42,18 +42,18 @@ def wet_triangles(corners, normal, height):
 
 
 def unsigned_cross(a, b):
-    """a × b with its differences made sums: a bound for the rounding of a cross product of magnitudes."""
+    """Return a × b with its differences made sums: a bound for the rounding of a cross product of magnitudes."""
     return a[..., [1, 2, 0]] * b[..., [2, 0, 1]] + a[..., [2, 0, 1]] * b[..., [1, 2, 0]]
 
 
 def outward_normals(corners):
-    """Unit normals (m, 3) of counter-clockwise triangles."""
+    """Return unit normals (m, 3) of counter-clockwise triangles."""
     n = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return n / np.linalg.norm(n, axis=-1, keepdims=True)
 
 
 def displacement(corners, normal, height):
-    """Volume (n,) and its centroid (n, 3) below the plane, as pyramids over the wet parts of the faces.
+    """Return volume (n,) and its centroid (n, 3) below the plane, as pyramids over the wet parts of the faces.
 
     The apex is the plane's point nearest to the body origin: the lid in the plane has no height over it.
     """
@@ -70,7 +70,7 @@ def displacement(corners, normal, height):
 
 
 def drag(corners, normal, height, nu, water_b, gradient_b, density, form, skin):
-    """Form and skin drag of the wet parts, wrench about the body origin (n, 6), and the sum of its magnitudes (n, 6).
+    """Return form and skin drag of the wet parts about the body origin (n, 6), and the sum of magnitudes (n, 6).
 
     dF = ½ρ A (C_form [-cos]_+ |v|² v̂ + C_skin |v_t| v_t), v the water past the wet part's centroid      (paper, eq. 4)
     """

@@ -1,4 +1,5 @@
-"""What the tests of importers share: motion of the imported vehicle beside its origin's, and changes of a file."""
+"""Shared code of the importers' tests: motion of the imported vehicle and of its origin, and changes of a
+file."""
 
 from xml.etree.ElementTree import tostring
 
@@ -13,7 +14,7 @@ from reference.gz_sim import element, euler
 
 
 def setting(path, text, **attributes):
-    """A change that writes a text into the first element of a path."""
+    """Return a change that writes a text into the first element of a path."""
 
     def change(root):
         root.find(path).text = text
@@ -27,7 +28,7 @@ def adding(path, tag, text=None, **attributes):
 
 
 def simulated(vehicle, R, nu, tau, duration):
-    """Velocities of a free vehicle under constant wrenches, every 0.05 s, (t, n, 6)."""
+    """Return velocities of a free vehicle under constant wrenches, every 0.05 s, (t, n, 6)."""
     simulator = Simulator(vehicle, worlds=len(nu), control_step=0.05, substeps=10, integrator="rk4")
     quaternions = np.array([matrix_to_quat(x) for x in R])[:, None]
     simulator.place(position=(0.0, 0.0, -200.0), quaternion=quaternions, velocity=nu[:, None])
@@ -40,7 +41,7 @@ def simulated(vehicle, R, nu, tau, duration):
 
 
 def driven(vehicle, duration):
-    """Velocity of a free vehicle with its thrusters at full static thrust for a while, from rest, (6,)."""
+    """Return the velocity of a free vehicle from rest, after its thrusters ran at full static thrust, (6,)."""
     simulator = Simulator(vehicle, control_step=0.05, substeps=10, integrator="rk4")
     simulator.place(position=(0.0, 0.0, -200.0))
     simulator.set_thrust(vehicle.force_limits[1])
@@ -50,13 +51,13 @@ def driven(vehicle, duration):
 
 
 def assert_moves_alike(vehicle, origin, force, duration=4.0, tolerance=0.002, ahead=(0.0, 0.0)):
-    """Six steps of force, release at rest, and a decay from a tilt with all velocities, at all times.
+    """Compare six steps of force, release at rest, and a decay from a tilt with all velocities, at all times.
 
     Args:
         vehicle: The imported vehicle.
         origin: Equations of the other program.
         force: Step along each axis [N, N m], (6,).
-        duration: Of each motion [s].
+        duration: Duration of each motion [s].
         tolerance: Share of the greatest velocity.
         ahead: Surge force [N] and speed [m/s] of all motions.
     """
@@ -74,7 +75,7 @@ def assert_moves_alike(vehicle, origin, force, duration=4.0, tolerance=0.002, ah
 
 
 def unnoticed(root, read, path):
-    """Names of elements that can get an x at their end without a refusal and without a note.
+    """Return names of elements to which an x can be appended without a refusal and without a note.
 
     Args:
         root: Function that makes the root of a file.

@@ -9,12 +9,12 @@ from typing import Any
 def install(
     folder: Path, monkeypatch: Any, name: str, source: str, members: Mapping[str, Mapping[str, str]]
 ) -> None:
-    """Write a package with entry points into a folder of its own, and put that on the search path.
+    """Write a package with entry points into its own folder, and put that on the search path.
 
     Args:
-        folder: Where to.
-        monkeypatch: Takes the path, and the imported module, back after the test.
-        name: Of distribution and module; its version is 1.0.
+        folder: Target folder.
+        monkeypatch: Fixture that removes the path and the imported module after the test.
+        name: Name of distribution and module; its version is 1.0.
         source: Code of the module.
         members: Family -> name -> module:object.
     """

@@ -1,8 +1,8 @@
-"""Settings of small learners, for tests of what the environments give them."""
+"""Settings of small learners, for tests of the environments' outputs."""
 
 
 def rsl_rl_settings(steps=4, gamma=0.9, rate=1e-3):
-    """What RSL-RL's runner needs to know."""
+    """Return the settings of RSL-RL's runner."""
     model = {"class_name": "MLPModel", "hidden_dims": [8], "activation": "elu"}
     noise = {"class_name": "GaussianDistribution", "init_std": 0.5, "std_type": "log"}
     return {

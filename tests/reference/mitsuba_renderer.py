@@ -1,9 +1,9 @@
-"""The overhead camera's scene rendered by Mitsuba 3: an independent referee of our ray caster.
+"""The overhead camera's scene rendered by Mitsuba 3: an independent reference for the ray caster.
 
 Geometry and Fresnel losses are Mitsuba's: a smooth dielectric surface (a mesh with interpolated normals where it
-ripples), window layers, tags and the plain basin as surfaces that glow with the radiance the scene gives them.
-Light therefore needs no way in through the surface, which a path tracer would hardly find. Water is clear: attenuation
-and veil, tiles and motion are ours alone.
+ripples), window layers, tags and the plain basin as surfaces that glow with the scene's radiance. Light therefore
+needs no path in through the surface, which a path tracer would hardly find. Water is clear: attenuation and veil,
+tiles and motion are not checked here.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ __all__ = ["radiance_by_mitsuba", "render_with_mitsuba"]
 Array = NDArray[np.float64]
 
 FINE = 2
-"""Mitsuba's pixels per pixel along each axis; it knows no lens distortion, so its picture is resampled."""
+"""Mitsuba's pixels per pixel along each axis; it has no lens distortion, so its picture is resampled."""
 CELL = 0.004
 """Spacing of the vertices of a rippling surface [m]."""
 FAR = 50.0
@@ -38,14 +38,14 @@ FAR = 50.0
 def render_with_mitsuba(
     scene: Scene, *, time: float = 0.0, seed: int = 0, region: Any = None, rays: int = 16
 ) -> NDArray[np.uint8]:
-    """One picture of a scene, as `OverheadCamera.render` gives it; zero outside the region.
+    """Return one picture of a scene, like `OverheadCamera.render`; zero outside the region.
 
     Args:
-        scene: Its sensor turns Mitsuba's radiance into numbers.
+        scene: The scene; its sensor turns Mitsuba's radiance into numbers.
         time: Middle of the exposure [s].
-        seed: Of Mitsuba and of the noise.
+        seed: Seed of Mitsuba and of the noise.
         region: (left, top, right, bottom) in pixels, or several; None for the whole picture, which takes minutes.
-        rays: Per pixel of Mitsuba's picture, which has 4 for one of ours.
+        rays: Rays per pixel of Mitsuba's picture, which has 4 for one of the camera's.
 
     Raises:
         SensorError: Something in the scene moves.
@@ -66,14 +66,14 @@ def render_with_mitsuba(
 def radiance_by_mitsuba(
     scene: Scene, region: Rectangle, *, time: float = 0.0, seed: int = 0, rays: int = 16
 ) -> NDArray[np.float32]:
-    """Radiance of the pixels of a rectangle, (rows, columns, 3).
+    """Return the radiance of the pixels of a rectangle, (rows, columns, 3).
 
     Args:
-        scene: What is seen, as of `render_with_mitsuba`.
+        scene: The scene, as in `render_with_mitsuba`.
         region: The rectangle [px].
         time: Middle of the exposure [s].
-        seed: Of Mitsuba.
-        rays: Per pixel of Mitsuba's picture, which has 4 for one of ours.
+        seed: Seed of Mitsuba.
+        rays: Rays per pixel of Mitsuba's picture, which has 4 for one of the camera's.
 
     Raises:
         SensorError: Something in the scene moves.
@@ -100,7 +100,8 @@ def radiance_by_mitsuba(
 
 
 class _Film:
-    """Mitsuba's undistorted picture of a rectangle of ours: a film centred on the optical axis, cropped."""
+    """Mitsuba's undistorted picture of a rectangle of the camera's: a film centred on the optical axis,
+    cropped."""
 
     def __init__(self, scene: Scene, region: Rectangle) -> None:
         lens = scene.camera.lens
@@ -120,7 +121,7 @@ class _Film:
         self.size = np.ceil(self.at.max((0, 1))).astype(int) + 2 + self.half - self.first
 
     def sensor(self, mi: Any, scene: Scene, rays: int) -> dict[str, Any]:
-        """Camera and film."""
+        """Return camera and film."""
         matrix = np.eye(4)
         matrix[:3, :3] = scene.camera.R_pc @ np.diag([-1.0, -1.0, 1.0])  # Mitsuba's x is left, y up
         matrix[:3, 3] = scene.camera.position
@@ -146,13 +147,14 @@ class _Film:
         }
 
     def footprint(self, scene: Scene, frame: SurfaceFrame) -> Array:
-        """Where the picture's rays meet the still surface, surface frame: lower and upper corner [m], (2, 2)."""
+        """Return corners of the area where rays meet the still surface, surface frame: lower and upper [m],
+        (2, 2)."""
         ray = self.rays @ (frame.R_sp @ scene.camera.R_pc).T
         at = -frame.camera_height * ray[..., :2] / np.minimum(ray[..., 2:], -0.05)
         return np.stack([at.min((0, 1)), at.max((0, 1))])
 
     def resampled(self, picture: NDArray[np.float32], scene: Scene) -> NDArray[np.float32]:
-        """Our pixels from Mitsuba's, bilinear at FINE x FINE points of each."""
+        """Return the camera's pixels from Mitsuba's, bilinear at FINE x FINE points of each."""
         from scipy.ndimage import map_coordinates
 
         x, y = np.moveaxis(self.at + self.half - self.first - 0.5, -1, 0)
@@ -170,7 +172,8 @@ def _matrix(mi: Any, R: Array, origin: Any, scale: Any) -> Any:
 
 
 def _glowing(mi: Any, radiance: Any, gain: float) -> dict[str, Any]:
-    """A surface that emits and reflects nothing; `radiance` is a colour, or cells as printed, top row first."""
+    """Return a surface that emits and reflects nothing; `radiance` is a colour, or cells as printed, top row
+    first."""
     if np.ndim(radiance) == 2:
         cells = np.repeat(np.asarray(radiance, np.float32)[::-1, :, None], 3, axis=2)
         light = {"type": "bitmap", "bitmap": mi.Bitmap(gain * cells), "raw": True, "filter_type": "nearest"}
@@ -181,15 +184,16 @@ def _glowing(mi: Any, radiance: Any, gain: float) -> dict[str, Any]:
 
 
 def _gain(scene: Scene, pose: ObjectPose) -> float:
-    """What brings radiance behind the surface to the camera's side: light spreads by the indices squared."""
+    """Return the factor from radiance behind the surface to the camera's side: light spreads by the indices
+    squared."""
     wet = float(scene.interface.distance(np.asarray(pose.position))) < 0.0
     return (scene.interface.index_far / scene.interface.index_near) ** 2 if wet else 1.0
 
 
 def _tag(mi: Any, tag: TagInScene, name: str, gain: float) -> dict[str, Any]:
-    """The bitmap 0.1 mm above the tag's plane, half-way to it the white board whose rim is the margin.
+    """Return the bitmap 0.1 mm above the tag's plane, and half-way to it the white board whose rim is the margin.
 
-    So both are seen where the tag lies on a wall.
+    Both are therefore visible where the tag lies on a wall.
     """
     R = quat_to_matrix(tag.pose.orientation)
     print_half, board = 0.5 * tag.cell * len(tag.bitmap), tag.half_size
@@ -210,7 +214,7 @@ def _tag(mi: Any, tag: TagInScene, name: str, gain: float) -> dict[str, Any]:
 
 
 def _basin(mi: Any, scene: Scene) -> dict[str, Any]:
-    """The inside of the box without its lid, the face on the camera's side."""
+    """Return the inside of the box without its lid, the face on the camera's side."""
     lower, upper = np.asarray(scene.basin.lower, float), np.asarray(scene.basin.upper, float)
     middle, half = 0.5 * (lower + upper), 0.5 * (upper - lower)
     gain = (scene.interface.index_far / scene.interface.index_near) ** 2
@@ -230,7 +234,7 @@ def _basin(mi: Any, scene: Scene) -> dict[str, Any]:
 
 
 def _surface(mi: Any, scene: Scene, frame: SurfaceFrame, footprint: Array, time: float) -> dict[str, Any]:
-    """Smooth dielectric faces, from the camera's side on."""
+    """Return smooth dielectric faces, in order from the camera's side."""
     interface = scene.interface
     if scene.ripples is not None:
         return {"surface": _rippling(mi, scene, frame, footprint, time)}
@@ -249,7 +253,7 @@ def _surface(mi: Any, scene: Scene, frame: SurfaceFrame, footprint: Array, time:
 
 
 def _rippling(mi: Any, scene: Scene, frame: SurfaceFrame, footprint: Array, time: float) -> Any:
-    """A mesh of the heights under the picture, whose normals are those of the slopes."""
+    """Return a mesh of the heights under the picture, with normals of the slopes."""
     assert scene.ripples is not None
     low, high = footprint[0] - 0.05, footprint[1] + 0.05
     x, y = (np.arange(a, b + CELL, CELL) for a, b in zip(low, high, strict=True))

@@ -22,7 +22,7 @@ from reference.water import flow
 
 @dataclass(frozen=True)
 class Numbers:
-    """What the equation needs of a vehicle, float64, about the body origin."""
+    """Parameters of a vehicle in the equation, float64, about the body origin."""
 
     density: float
     gravity: float
@@ -66,12 +66,12 @@ def numbers(vehicle, model):
 
 
 def wrench_of_force(r, force):
-    """[F; r × F]."""
+    """Return [F; r × F]."""
     return np.concatenate([force, np.cross(r, force)], axis=-1)
 
 
 def damping(n, nu_r):
-    """Wrench about the body origin of the damping matrices, which hold at r_h."""
+    """Return the wrench about the body origin of the damping matrices, which apply at r_h."""
     H = transformation(n.r_h)
     nu_h = nu_r @ H.T
     D = n.D1 + n.D2 * np.abs(nu_h)[..., None, :] + n.Du * np.abs(nu_h[..., :1, None])
@@ -79,7 +79,8 @@ def damping(n, nu_r):
 
 
 def coriolis_size(M, nu):
-    """Magnitudes that C(nu) nu is a sum of: |ω| ⊗ |p| and |v| ⊗ |p| + |ω| ⊗ |h|, with no sign to cancel."""
+    """Return the magnitudes of the terms of C(nu) nu without cancellation: |ω| ⊗ |p| and |v| ⊗ |p| + |ω| ⊗
+    |h|."""
     momentum = np.abs(nu) @ np.abs(M).T
     v, omega, p, h = np.abs(nu[:, :3]), np.abs(nu[:, 3:]), momentum[:, :3], momentum[:, 3:]
     return np.concatenate(
@@ -88,7 +89,10 @@ def coriolis_size(M, nu):
 
 
 def submersion(n, height):
-    """Share of the volume under water, from the height of the centre of buoyancy: 0 above half_height, 1 below it."""
+    """Return the submerged share of the volume from the height of the centre of buoyancy.
+
+    It is 0 above half_height and 1 below it.
+    """
     s = np.clip((n.half_height - height) / (2.0 * n.half_height), 0.0, 1.0)
     return 3.0 * s**2 - 2.0 * s**3
 
@@ -98,17 +102,19 @@ DEEP = np.array([[0.0, 0.0, 1.0]]), np.array([-1e3])
 
 
 def growth_under_water(n, model, up, surface, height, height_b, nu_r, dt=1e-6):
-    """Rate of the share of the volume under water, by a central difference along the motion through the water [1/s].
+    """Return the rate of the submerged share of the volume [1/s].
+
+    It is a central difference along the motion through the water.
 
     Args:
-        n: From `numbers`.
+        n: Result of `numbers`.
         model: calibrated, mesh or simplified.
         up: World z axis in the body frame (N, 3).
         surface: Normal of the water surface in the body frame (N, 3).
-        height: Of the body origin above that plane (N,).
-        height_b: Of the centre of buoyancy above the surface, straight up (N,).
-        nu_r: Relative to the water (N, 6).
-        dt: [s].
+        height: Height of the body origin above that plane (N,).
+        height_b: Height of the centre of buoyancy above the surface, straight up (N,).
+        nu_r: Velocity relative to the water (N, 6).
+        dt: Time step of the difference [s].
     """
 
     def share(t):
@@ -124,18 +130,18 @@ def growth_under_water(n, model, up, surface, height, height_b, nu_r, dt=1e-6):
 
 
 def acceleration(n, model, position, q, nu, tau, water=None, t=0.0, thrust=None):
-    """nu_dot, and a bound of what it is a sum of, for rounding.
+    """Return nu_dot, and a bound of the sum of its terms' magnitudes, for rounding.
 
     Args:
-        n: From `numbers`.
+        n: Result of `numbers`.
         model: calibrated, mesh or simplified.
-        position: World frame (N, 3).
-        q: xyzw (N, 4).
-        nu: (N, 6).
+        position: Position, world frame (N, 3).
+        q: Attitude, xyzw (N, 4).
+        nu: Velocity (N, 6).
         tau: Other wrenches about the body origin, body frame (N, 6).
         water: `finssim.sim.Water` without drift; still if None.
         t: Time [s].
-        thrust: Wrench of the thrusters (N, 6), which fades with the part of the volume that is out of the water.
+        thrust: Wrench of the thrusters (N, 6), which fades with the emerged part of the volume.
 
     Returns:
         nu_dot (N, 6) and |M⁻¹| |M| |M⁻¹| Σ |wrenches| (N, 6).
@@ -151,7 +157,7 @@ def acceleration(n, model, position, q, nu, tau, water=None, t=0.0, thrust=None)
         elevation, surface = around.elevation, times(Rt, around.normal)
         height = around.normal[:, 2] * (position[:, 2] - elevation)
         v_c, local = times(Rt, around.velocity), around.acceleration
-        # Rate of the water's velocity as the body passes, and as the water itself goes.
+        # Rate of the water's velocity due to the body's motion, and due to the water's own.
         a_x = times(Rt, local + times(around.gradient, times(R, nu[:, :3])))
         a_c = times(Rt, local + times(around.gradient, around.velocity))
         G_b = Rt @ around.gradient @ R
@@ -187,7 +193,7 @@ def acceleration(n, model, position, q, nu, tau, water=None, t=0.0, thrust=None)
         ]
         sizes.append(coriolis_size(n.M_A, np.abs(nu_r) + np.abs(nu)))
     if thrust is not None:
-        sizes.append(np.abs(thrust))  # the engine adds and takes off what submerged thrusters would do
+        sizes.append(np.abs(thrust))  # the engine adds and removes the effect of submerged thrusters
     total = sum(terms) + tau_D
     size = sum(np.abs(x) for x in terms) + sum(sizes)
     M = n.M_RB + wet[:, None, None] * n.M_A
@@ -197,7 +203,7 @@ def acceleration(n, model, position, q, nu, tau, water=None, t=0.0, thrust=None)
 
 
 def energy(n, model, position, q, nu):
-    """Kinetic energy of body and added mass, potential energy of weight and buoyancy, in still water (N,) [J].
+    """Return kinetic energy with added mass plus potential energy of weight and buoyancy, in still water (N,) [J].
 
     T + m g z_g + U_b, with T = ½ nuᵀ (M_RB + s M_A) nu of the wet share s, and U_b the work against buoyancy:
     -ρ g ∫ z dV over the wet hull, or of the faded volume -ρ g V ∫ s dz; a hull whose centroid is not the centre of
@@ -219,5 +225,5 @@ def energy(n, model, position, q, nu):
         return kinetic, weight, -full * volume / whole[0] * height
     s = (n.half_height - position[:, 2] - up @ n.r_b) / (2.0 * n.half_height)
     c = np.clip(s, 0.0, 1.0)
-    # ∫ s(z) dz from above: 2 H (c³ - c⁴/2), and 2 H (s - 1) more where wholly under water.
+    # ∫ s(z) dz from above: 2 H (c³ - c⁴/2), plus 2 H (s - 1) where wholly under water.
     return kinetic, weight, full * 2.0 * n.half_height * (c**3 - 0.5 * c**4 + np.maximum(s - 1.0, 0.0))

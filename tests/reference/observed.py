@@ -1,4 +1,4 @@
-"""What T1 and T2 show, as published, written out a second time with SciPy's rotations."""
+"""Observations of T1 and T2, as published, implemented a second time with SciPy's rotations."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -7,7 +7,7 @@ from finssim.core.rotations import quat_from_yaw
 
 
 def published_t1(measured, guide, t=0.0):
-    """The 16 numbers of T1."""
+    """Return the 16 numbers of T1."""
     R, goal = Rotation.from_quat(measured.quaternion).inv(), guide.at(t)
     offset = R.apply(goal.position - measured.position) / 3.0
     turned = (R * Rotation.from_quat(quat_from_yaw(goal.yaw))).as_matrix()
@@ -16,7 +16,7 @@ def published_t1(measured, guide, t=0.0):
 
 
 def published_t2(measured, guide, t):
-    """The 30 numbers of T2."""
+    """Return the 30 numbers of T2."""
     R = Rotation.from_quat(measured.quaternion).inv()
     offsets = [R.apply(guide.at(t + k).position - measured.position) / 3.0 for k in (0.0, 0.1, 0.2, 0.3)]
     now = guide.at(t)

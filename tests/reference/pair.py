@@ -1,6 +1,6 @@
-"""A task of two agents and one vehicle of the task's own, for tests: an agent's place is 0.3 m beside a goal.
+"""A task of two agents and one vehicle of the task's own, for tests: an agent's target is 0.3 m beside a goal.
 
-Reward of agent a: (a + 1) `bonus` - `slope` · distance to its place. No term is any other task's.
+Reward of agent a: (a + 1) `bonus` - `slope` · distance to its target. No other task has these terms.
 """
 
 from dataclasses import dataclass
@@ -70,7 +70,7 @@ def stand(arrays: TaskArrays, w: int):
 
 @dataclass(frozen=True, kw_only=True)
 class Pair(Task):
-    """Two agents side by side, and one that stands."""
+    """Two agents side by side, and one vehicle at rest."""
 
     agents: ClassVar[tuple[str, ...]] = ("left", "right")
     others: ClassVar[tuple[str, ...]] = ("post",)
@@ -96,9 +96,10 @@ class Pair(Task):
 
 
 def constant(**settings: Any) -> Pair:
-    """Every step gives agent a the reward a + 1: after any policy its value is (a + 1) / (1 - γ)."""
+    """Return a task with reward a + 1 for agent a in every step: the value of any policy is (a + 1) / (1 -
+    γ)."""
     return Pair(bonus=1.0, slope=0.0, bound=1e9, **settings)
 
 
 KINDS = pytest.mark.parametrize("task", ["t1", "team-pursuit", Pair()], ids=["t1", "team-pursuit", "pair"])
-"""For adapters: a vehicle alone, a team and a prey that the task drives, and a pair."""
+"""Tasks for adapters: a vehicle alone, a team and a prey that the task drives, and a pair."""

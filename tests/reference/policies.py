@@ -1,4 +1,4 @@
-"""Policy directories of networks that tests make."""
+"""Policy directories of networks made by tests."""
 
 import numpy as np
 from onnx import TensorProto, helper, numpy_helper
@@ -11,11 +11,11 @@ from finssim.vehicles import load_vehicle
 
 FINSROV = load_vehicle("finsrov")
 SHAPE = (27, 48, 3)
-"""Of the pictures that `seeing` sees."""
+"""Shape of the pictures of `seeing`."""
 
 
 def linear(gain):
-    """A network without bias: action = gain · observation."""
+    """Return a network without bias: action = gain · observation."""
     import torch
     from torch import nn
 
@@ -25,7 +25,7 @@ def linear(gain):
 
 
 def written(network, folder, task, size):
-    """A policy directory of a network."""
+    """Return a policy directory of a network."""
     description = PolicyDescription(
         task=task.name,
         observation=task.schema,
@@ -40,7 +40,7 @@ def written(network, folder, task, size):
 
 
 def _light():
-    """Surge is the mean of red, sway that of blue, as parts of 255; the row is not looked at."""
+    """Return a network: surge is the mean of red, sway that of blue, as parts of 255; the row is ignored."""
     weights = np.zeros((6, 3), np.float32)
     weights[0, 0] = weights[1, 2] = 1.0 / 255.0
     constants = [numpy_helper.from_array(weights, "gain"), numpy_helper.from_array(np.array([1, 2]), "axes")]
@@ -60,7 +60,8 @@ def _light():
 
 
 def seeing(folder):
-    """A policy directory for docking by camera: surge is the mean of red in the picture, sway that of blue."""
+    """Return a policy directory for docking by camera: surge is the mean of red in the picture, sway that of
+    blue."""
     task = task_named("camera-docking")
     about = {"device": "low_light_camera", "shape": list(SHAPE), "rate": 10.0, "latency": 0.1}
     description = PolicyDescription(

@@ -1,4 +1,4 @@
-"""A virtual pool in lock-step behind a port, as `finssim pool --lockstep` serves it, and a person beside it."""
+"""A virtual pool in lock-step behind a port, like `finssim pool --lockstep`, and a simulated operator."""
 
 import math
 import threading
@@ -17,7 +17,7 @@ from finssim.vehicles.defaults import vehicle_at
 
 
 class Silent(VirtualPool):
-    """Its motor controller says nothing more from a time on [s]."""
+    """Pool whose motor controller is silent from a time on [s]."""
 
     silent_from = math.inf
 
@@ -41,9 +41,10 @@ def lockstep_pool(
     site="pool",
     positioning="none",
 ):
-    """The wiring to a pool that lives for as long as the block; its pool file is written; None: no camera looks.
+    """Write the pool file, and yield the wiring to a pool that lives as long as the block.
 
-    A pool ends when its robot leaves: with several `sessions` another one then begins on the same port.
+    Without a pool file there is no camera. A pool ends when its robot leaves: with several `sessions` another one then
+    begins on the same port.
     """
     start_warp()
     vehicle, spec = vehicle_at(site, vehicle), site_of(site, draw_plant(vehicle, plant, severity))
@@ -68,7 +69,7 @@ def lockstep_pool(
         return made
 
     first = LockstepServer(("127.0.0.1", 0))
-    pools = [world()]  # here: while one thread captures launches, another may not copy arrays
+    pools = [world()]  # made here: while one thread captures launches, another may not copy arrays
 
     def serve():
         server = first
@@ -89,7 +90,8 @@ def lockstep_pool(
 
 
 class Person:
-    """Presses keys, each at the first line that holds its words; after the last one enter whenever asked to."""
+    """Operator who presses keys, each at the first line with its text, and after the last one enter at each
+    request."""
 
     def __init__(self, *presses, then="\r"):
         self._presses, self._then, self.read, self._key = list(presses), then, [], ""

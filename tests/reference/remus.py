@@ -27,7 +27,7 @@ class Remus(Torpedo):
 
     Args:
         shaft_lag: Time constant of the propeller [s]: 1 of `remus100`, 0.1 of `torpedo`.
-        fin_drag: Whether a deflected fin has drag: so it is of `remus100`, not of `torpedo`.
+        fin_drag: Whether a deflected fin has drag, as in `remus100` but not in `torpedo`.
     """
 
     def __init__(self, shaft_lag=1.0, fin_drag=True):
@@ -36,7 +36,7 @@ class Remus(Torpedo):
         self.M = self.M_RB + self.M_A
 
     def propulsion(self, U):
-        """Thrust less its deduction, and a tenth of the torque, by K_T and K_Q that are linear in J."""
+        """Return thrust less its deduction, and a tenth of the torque, by K_T and K_Q that are linear in J."""
         n, D = self.rpm / 60, 0.14
         out = np.zeros(6)
         for i, power, at_rest, at_top, share in ((0, 4, 0.4566, 0.1798, 0.9), (3, 5, 0.0700, 0.0312, 0.1)):
@@ -45,7 +45,7 @@ class Remus(Torpedo):
         return out
 
     def fins(self, nu, rudder, plane):
-        """Lift by the deflection alone, at the stern, in the plane in which a pair of fins is turned."""
+        """Return lift by the deflection alone, at the stern, in the plane in which a pair of fins is turned."""
         out = np.zeros(6)
         for i, j, angle, slope, sign in ((1, 5, rudder, SLOPES[0], 1), (2, 4, plane, SLOPES[1], -1)):
             q = 0.5 * self.rho * AREA * slope * (nu[0] ** 2 + nu[i] ** 2)
@@ -55,11 +55,11 @@ class Remus(Torpedo):
         return out
 
     def acceleration(self, eta, nu, actuators):
-        """d nu/dt of place and angles (6,), velocity (6,) and actuators (3,)."""
+        """Return d nu/dt from pose (6,), velocity (6,) and actuators (3,)."""
         rudder, plane = np.clip(actuators[:2], -LARGEST, LARGEST)
         self.rpm = float(np.clip(actuators[2], -FASTEST, FASTEST))
         roll, pitch = eta[3:5]
-        turn = np.zeros((1, 3, 3))  # of which `rate` reads the world's z axis, upwards, in axes with z up
+        turn = np.zeros((1, 3, 3))  # `rate` reads from it the world's z axis, upwards, in axes with z up
         turn[0, 2] = math.sin(pitch), math.cos(pitch) * math.sin(roll), math.cos(pitch) * math.cos(roll)
         return self.rate(turn, (nu * F)[None], (self.fins(nu, rudder, plane) * F)[None])[0] * F
 
@@ -69,8 +69,8 @@ class Autopilot:
     """Depth by pitch with cascaded PID, heading by a sliding mode with reference model and integral.
 
     Attributes:
-        depth: To reach [m].
-        heading: To reach, positive to the right [rad].
+        depth: Target depth [m].
+        heading: Target heading, positive to the right [rad].
     """
 
     depth: float = 0.0
@@ -81,7 +81,7 @@ class Autopilot:
         self.angle = self.rate = self.growth = self.sum_heading = 0.0
 
     def command(self, depth, pitch, heading, w, q, r, h):
-        """Rudder and stern plane [rad] from the state, z down, every h seconds."""
+        """Return rudder and stern plane [rad] from the state, z down, every h seconds."""
         keep = math.exp(-0.02 * h)
         self.smooth = keep * self.smooth + (1 - keep) * self.depth
         low = depth - self.smooth
@@ -104,12 +104,12 @@ class Autopilot:
 
 
 def run(vehicle, duration, command):
-    """Motion from rest at the surface by explicit steps: times (n,), place and angles (n, 6), velocities (n, 6).
+    """Return motion from rest at the surface by explicit steps: times (n,), poses (n, 6), velocities (n, 6).
 
     Args:
         vehicle: A `Remus`.
-        duration: Of the motion [s].
-        command: Function of place and angles (6,), and velocity (6,) to rudder, stern plane [rad] and shaft [rpm].
+        duration: Duration of the motion [s].
+        command: Function of pose (6,) and velocity (6,) that returns rudder, stern plane [rad] and shaft [rpm].
     """
     eta, nu, actuators, rows = np.zeros(6), np.zeros(6), np.zeros(3), []
     for _ in range(round(duration / STEP) + 1):
@@ -126,6 +126,6 @@ def run(vehicle, duration, command):
 
 
 def step_response(times, values, target, band=0.02):
-    """Overshoot [share of the step] and time after which a step from 0 stays within a band of its target [s]."""
+    """Return overshoot [share of the step] and settling time of a step from 0 into a band of its target [s]."""
     away = np.flatnonzero(np.abs(values / target - 1.0) > band)
     return max(float(np.max(values / target)) - 1.0, 0.0), float(times[away[-1] + 1])

@@ -1,4 +1,4 @@
-"""Where a rigid box comes to rest on the solids of a described world, by MuJoCo: an independent referee of contacts.
+"""Rest pose of a rigid box on the solids of a described world, by MuJoCo: an independent reference of contacts.
 
 MuJoCo's contacts are hard and its shapes are its own; only the geometry of the world and the vehicle's file are shared.
 """
@@ -14,7 +14,7 @@ SHELL = 1.0e-3
 
 
 def rest_pose(vehicle, layout, start, seconds=8.0):
-    """Return position [m] and rotation matrix (body to world) of the vehicle's envelope box, let go level at `start`.
+    """Return position [m] and rotation matrix (body to world) of the vehicle's envelope box, released level at `start`.
 
     The body has the weight, the buoyancy and the centres of the vehicle's file, and linear drag [N s/m, N m s/rad].
     """

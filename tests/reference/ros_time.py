@@ -1,5 +1,5 @@
 # ruff: noqa: E402 - rclpy can be imported once a backend is active
-"""Simulated time for nodes in the test's own process: it goes on when every node has seen the last step."""
+"""Simulated time for nodes in the test's own process: it advances when every node has received the last step."""
 
 import time
 
@@ -12,27 +12,27 @@ import rclpy
 from finssim.extensions.ros2.nodes.conversions import ros_type
 
 PATIENCE = 120.0
-"""Real time for one step, however busy the machine is [s]."""
+"""Time limit for one step on a busy machine [s]."""
 WORK = 8
-"""Callbacks of a node in one round."""
+"""Maximum number of callbacks of a node in one round."""
 
 
 class RosTime:
     """A /clock, with `use_sim_time` as a parameter of the nodes; nothing depends on the speed of the machine."""
 
     def __init__(self, peer, nodes, step=0.01, start=100.0):
-        """Of a node that publishes, and of those that live by it; times in seconds."""
+        """Publish time by `peer` for `nodes` that use it; times in seconds."""
         self.peer, self.nodes, self.step, self.now = peer, nodes, step, start
         self._kind = ros_type("rosgraph_msgs/msg/Clock")
         self._clock = peer.create_publisher(self._kind, "/clock", 1)
 
     @property
     def ns(self):
-        """The time as a stamp [ns]."""
+        """Time as a stamp [ns]."""
         return round(self.now * 1e9)
 
     def turn(self):
-        """Go one step further, and let everybody do what has come."""
+        """Advance by one step, and run all pending callbacks."""
         self.now += self.step
         message = self._kind()
         message.clock.sec, message.clock.nanosec = divmod(self.ns, 10**9)
@@ -47,7 +47,8 @@ class RosTime:
             assert time.monotonic() < end, f"a node has not seen {self.now:.2f} s"
 
     def until(self, condition, each, longest=30.0):
-        """Turn until a condition holds, after something that is done in each step; whether it does in time [s]."""
+        """Turn until a condition is true, calling `each` before each step; return whether it became true in
+        time [s]."""
         end = self.now + longest
         while not condition() and self.now < end:
             each()

@@ -1,4 +1,5 @@
-"""A vehicle that goes its rounds in a pool by a closed form, what its sensors say of it, and where its tags appear."""
+"""A vehicle that circles in a pool by a closed form, with its sensor readings and the image positions of its
+tags."""
 
 import math
 
@@ -24,7 +25,7 @@ LENS = Lens(1280, 720, 540.93, 540.93, 682.23, 348.61, "plumb_bob", (0.0294, -0.
 
 
 def overhead(latency=0.05, **frames):
-    """A camera 1.2 m above level water at z = 0 of the pool frame."""
+    """Return a camera 1.2 m above level water at z = 0 of the pool frame."""
     return Pool(Camera(LENS, [0.0, 0.0, 1.2], [1.0, 0.0, 0.0, 0.0]), Interface.water(0.0), latency, **frames)
 
 
@@ -40,16 +41,16 @@ class Rounds:
         self.port = np.asarray(self.vehicle.sensors.depth.position)
 
     def position(self, t):
-        """Of the body origin, world frame [m], (3,)."""
+        """Return the position of the body origin, world frame [m], (3,)."""
         a = self.speed * t
         return np.array([0.6 * math.cos(a), 0.4 * math.sin(a), -0.45 + 0.05 * math.sin(2.0 * a)])
 
     def quaternion(self, t):
-        """Body to world, xyzw, (4,)."""
+        """Return the attitude, body to world, xyzw, (4,)."""
         return quat_from_euler(0.05 * math.sin(3.0 * t), 0.04 * math.cos(2.3 * t), 2.0 * self.speed * t + 0.3)
 
     def nu(self, t, step=1e-4):
-        """Velocity of the body origin and angular velocity, body frame, by central differences, (6,)."""
+        """Return velocity and angular velocity of the body origin, body frame, by central differences, (6,)."""
         v = (self.position(t + step) - self.position(t - step)) / (2.0 * step)
         turn = quat_multiply(quat_conjugate(self.quaternion(t - step)), self.quaternion(t + step))
         return np.concatenate(
@@ -57,7 +58,8 @@ class Rounds:
         )
 
     def telemetry(self, t, sequence):
-        """What the motor controller sends at t; its own heading is another and drifts. No latency of the sensors."""
+        """Return the motor controller's message at t; its heading has an offset and drifts. Sensors have no
+        latency."""
         q, noise = self.quaternion(t), self.noise
         omega = self.nu(t)[3:] + noise * self.random.normal(0.0, 0.002, 3)
         force = quat_inverse_rotate(q, [0.0, 0.0, 9.81]) + noise * self.random.normal(0.0, 0.02, 3)
@@ -79,7 +81,7 @@ class Rounds:
         )
 
     def picture(self, exposed, sequence):
-        """The tags at the time of an exposure, as a picture that comes `Pool.latency` later."""
+        """Return the tags at the time of an exposure, as a picture that arrives `Pool.latency` later."""
         T = self.pool.T_pw
         R = T[:3, :3] @ quat_to_matrix(self.quaternion(exposed))
         origin = T[:3, :3] @ self.position(exposed) + T[:3, 3]
@@ -91,13 +93,13 @@ class Rounds:
 
 
 def yaw_between(a, b):
-    """Turn about the vertical from attitude a to b [rad]."""
+    """Return the rotation about the vertical from attitude a to b [rad]."""
     x, y, z, w = quat_multiply(b, quat_conjugate(a))
     return 2.0 * math.atan2(z, w) if w >= 0.0 else 2.0 * math.atan2(-z, -w)
 
 
 def without_latency(vehicle):
-    """The vehicle with sensors that answer at once."""
+    """Return the vehicle with sensors without latency."""
     sensors = vehicle.sensors
     sensors = sensors.model_copy(
         update={

@@ -1,4 +1,4 @@
-"""One vehicle in open water, as its motor controller's wire shows it."""
+"""One vehicle in open water, as seen through its motor controller's wire."""
 
 import time
 
@@ -15,7 +15,7 @@ class Sea:
     """FinsROV in open water, in real time on a UDP wire, with fixes of motion capture."""
 
     def __init__(self, place, robot=("127.0.0.1", 9), seed=1):
-        """Of a robot at an address, which may be told later."""
+        """Connect to a robot at an address, which `know` may change later."""
         plant = site_of("open-water", draw_plant(FINSROV, 0, "nominal"))
         self.world = VirtualPool(
             FINSROV,
@@ -32,7 +32,7 @@ class Sea:
         self.end = UdpTransport(self.end.address, robot)
 
     def turn(self, now=None):
-        """Let the world go on to this moment, or to a time since its begin [s]."""
+        """Advance the world to the present, or to a time since its start [s]."""
         self.now = max(time.monotonic() - self.began, self.now) if now is None else now
         for _, frame in self.world.exchange(self.now, self.end.receive()).frames:
             self.end.send(frame)

@@ -15,7 +15,7 @@ PERIOD = 0.1
 
 
 class Sailed(NamedTuple):
-    """What n vehicles did, by time, (steps, n, ...)."""
+    """Motion of n vehicles by time, (steps, n, ...)."""
 
     time: np.ndarray
     position: np.ndarray
@@ -31,10 +31,10 @@ def sailed(vehicle, orders, seconds, *, depth=10.0, speed=1.5, water=None, pilot
     Args:
         vehicle: The vehicle.
         orders: Arguments of `CoursePilot.command`, arrays with one number per vehicle.
-        seconds: How long.
-        depth: At the start [m].
-        speed: At the start [m/s].
-        water: Of `Simulator`.
+        seconds: Duration [s].
+        depth: Depth at the start [m].
+        speed: Speed at the start [m/s].
+        water: Water of the `Simulator`.
         pilot: The autopilot; that of the vehicle if None.
     """
     pilot = pilot or CoursePilot(linear_model(vehicle), vehicle.name, PERIOD)

@@ -1,8 +1,8 @@
 """Stonefish's equations of a robot, in float64 and independent of the importer, and a scenario of such a robot.
 
-Masses and moments are the textbook's. Surfaces are many small panels, but for the mesh, whose triangles are so large
-that their number matters. The drag is quadratic, as its documents say. The box has coefficients of its own and
-no added mass (`floating`).
+Masses and moments are the textbook's. Surfaces are many small panels, except for the mesh, whose triangles are so
+large that their number matters. The drag is quadratic, as documented. The box has its own coefficients and no added
+mass (`floating`).
 """
 
 import math
@@ -12,15 +12,15 @@ import numpy as np
 from reference import gz_sim
 
 FLIP = np.diag([1.0, -1.0, -1.0])
-"""From forward, right, down to forward, left, up."""
+"""Rotation from forward, right, down to forward, left, up."""
 RHO, GRAVITY = 1025.0, 9.81
 DENSITIES = {"Foam": 610.0, "Aluminium": 2710.0, "Steel": 7800.0, "Neutral": 1000.0}
 BOX, RADIUS, LENGTH, THICK, BALL = (0.6, 0.4, 0.3), 0.07, 0.5, 0.004, 0.06
 WEIGHT = 22.446
-"""Mass of the ballast with which it neither sinks nor rises, within 0.1 N [kg]."""
+"""Mass of the ballast that makes the robot neutral, within 0.1 N [kg]."""
 DRAG, SKIN = (0.9, 1.1, 1.2), (0.05, 0.06, 0.07)
 PLACES = {"port": (0.0, -0.25, -0.1), "starboard": (0.0, 0.25, -0.1)}
-"""Places of the shells of cylinders, whose axes lie along x."""
+"""Positions of the cylinders' shells, whose axes lie along x."""
 LAMP, KEEL, BALLAST = (0.0, 0.0, -0.2), (0.0, 0.0, 0.22), (0.0, 0.0, 0.12)
 KEEL_SIDES = (0.3, 0.04, 0.1)
 
@@ -41,7 +41,7 @@ TABLE = """<thrust_model type="linear_interpolation"><input value="-100 0 100"/>
 
 
 def robot(thrusters=None, weight=WEIGHT):
-    """The robot of a scenario."""
+    """Return the robot of a scenario."""
     shells = "".join(
         f"""<external_part name="{name}" type="cylinder" physics="submerged" buoyant="false">
           <dimensions radius="{RADIUS}" height="{LENGTH}" thickness="{THICK}"/><origin xyz="0 0 0" rpy="0 0 0"/>
@@ -81,7 +81,8 @@ def robot(thrusters=None, weight=WEIGHT):
 
 
 def write(folder, thrusters=None, weight=WEIGHT):
-    """The scenario, the file of the robot that it includes, and the mesh of its keel, ten times too large."""
+    """Write the scenario, the file of the robot that it includes, and the mesh of its keel, ten times too
+    large."""
     a, b, c = (5.0 * side for side in KEEL_SIDES)
     corners = [(x, y, z) for x in (-a, a) for y in (-b, b) for z in (-c, c)]
     sides = ("1 2 4 3", "5 7 8 6", "1 5 6 2", "3 4 8 7", "1 3 7 5", "2 6 8 4")
@@ -117,7 +118,7 @@ def _box_panels(sides, n=12):
 
 
 def _box_triangles(sides):
-    """Two triangles of each side, cut from its first corner as in the file."""
+    """Return two triangles of each side, cut from its first corner as in the file."""
     out = []
     half = np.array(sides) / 2.0
     for axis, sign, corner in (
@@ -250,7 +251,7 @@ class Origin(gz_sim.Origin):
         self.surfaces.append((*_box_triangles(KEEL_SIDES), FLIP @ KEEL, np.ones(3), np.full(3, 0.1)))
 
     def water(self, nu):
-        """Wrench of drag and friction of one state about the origin."""
+        """Return the wrench of drag and friction of one state about the origin."""
         out = np.zeros(6)
         for points, normal, area, place, drag, skin in self.surfaces:
             r = points + place
@@ -267,7 +268,8 @@ class Origin(gz_sim.Origin):
         return out
 
     def rate(self, R, nu, tau):
-        """Acceleration of many states: rotation body to world (n, 3, 3), velocity (n, 6), wrench (n, 6)."""
+        """Return the acceleration of many states: rotation body to world (n, 3, 3), velocity (n, 6), wrench
+        (n, 6)."""
         up, momentum = R[:, 2, :], nu @ self.rigid.T
         spun = np.cross(momentum[:, :3], nu[:, :3]) + np.cross(momentum[:, 3:], nu[:, 3:])
         wrench = (

@@ -1,4 +1,4 @@
-"""Pictures of tags whose corners are known exactly: a homography of the bitmap, integrated over every pixel."""
+"""Pictures of tags with exactly known corners: a homography of the bitmap, integrated over every pixel."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ WHITE, BLACK = 210.0, 40.0
 
 
 def homography(source, target):
-    """The homography that takes four points to four others, (4, 2) each -> (3, 3)."""
+    """Return the homography that maps four points to four others, (4, 2) each -> (3, 3)."""
     rows = []
     for (x, y), (u, v) in zip(source, target, strict=True):
         rows += [[x, y, 1, 0, 0, 0, -u * x, -u * y], [0, 0, 0, x, y, 1, -v * x, -v * y]]
@@ -17,15 +17,15 @@ def homography(source, target):
 
 
 def moved(H, points):
-    """Points taken through a homography, (..., 2)."""
+    """Return points transformed by a homography, (..., 2)."""
     p = np.asarray(points) @ H[:, :2].T + H[:, 2]
     return p[..., :2] / p[..., 2:]
 
 
 def pose_corners(edge, *, centre, turn=0.0, tilt=0.0, distance=6.0, towards=0.7):
-    """Corners in pixels of a tag turned in the image [rad], then tilted out of it [rad] about an axis at `towards`.
+    """Return pixel corners of a tag turned in the image [rad], then tilted out of it [rad] about an axis at `towards`.
 
-    `edge` is the length of the border in pixels were it not tilted, `distance` that of the eye in edges.
+    `edge` is the length of the border in pixels without tilt, `distance` that of the camera in edges.
     """
     ring = corners(1.0) * [1.0, -1.0, 1.0]  # v points down
     c, s = np.cos(turn), np.sin(turn)
@@ -38,17 +38,17 @@ def pose_corners(edge, *, centre, turn=0.0, tilt=0.0, distance=6.0, towards=0.7)
 def draw(
     shape, tags, *, family, margin=1.0, blur=0.0, noise=0.0, gamma=1.0, seed=0, oversampling=8, ground=120.0
 ):
-    """A gray picture of tags, uint8 (h, w), with pixels that average the light over their area.
+    """Return a gray picture of tags, uint8 (h, w), with pixels that average the light over their area.
 
     Args:
-        shape: (h, w) [px].
+        shape: Size (h, w) [px].
         tags: Id -> corners of the measured edge, pixels with integers at pixel centres, (4, 2).
-        family: Of all tags.
+        family: Family of all tags.
         margin: White margin around the bitmap [cells].
         blur: Standard deviation of the lens's blur [px].
         noise: Standard deviation of the sensor's noise [gray levels].
         gamma: Encoding: gray = 255 (light / 255)^(1/gamma).
-        seed: Of the noise.
+        seed: Seed of the noise.
         oversampling: Samples along each side of a pixel.
         ground: Light from around the tags [gray levels].
     """

@@ -1,4 +1,4 @@
-"""REMUS 100 with four fins of its own tail's size, that turn one by one: a cruciform or an X."""
+"""REMUS 100 with four separately turning fins, of the size of its own tail's: a cruciform or an X."""
 
 import math
 

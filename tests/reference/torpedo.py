@@ -28,7 +28,7 @@ SECTIONS = {
 
 
 def hull(actuators, **changes):
-    """A torpedo with one propeller, without hydrodynamic couplings, and some actuators."""
+    """Return a torpedo with one propeller, without hydrodynamic couplings, and some actuators."""
     ACTUATORS["brake"] = BRAKE
     text = {
         "title": "test hull", "description": "for tests", "water": {"density": RHO, "gravity": G},

@@ -11,7 +11,7 @@ from reference import gz_sim
 from reference.gz_sim import euler
 
 FLIP = np.diag([1.0, -1.0, -1.0])
-"""From forward, left, up to forward, right, down, and back."""
+"""Rotation from forward, left, up to forward, right, down, and back."""
 
 
 @dataclass
@@ -30,7 +30,7 @@ class Robot:
     box: tuple
     """Width, length, height [m]."""
     thrusters: list
-    """xyz and rpy of each."""
+    """xyz and rpy of each thruster."""
     forward: list = field(default_factory=lambda: [0.0] * 6)
     com: tuple = (0, 0, 0)
     neutral: bool = False
@@ -39,7 +39,7 @@ class Robot:
     prop: float = 0.001
     """Mass of a thruster's link [kg]."""
     sensor: tuple = (2.0, (-0.3, 0.1, 0.2))
-    """Mass and place of a link that is fixed to the base link."""
+    """Mass and position of a link that is fixed to the base link."""
 
 
 def _both(x, y, z, pitch, yaw):
@@ -66,7 +66,8 @@ LAUV = Robot(
     forward=list(np.diag([-8, -16, -10, -1.3, -2, -3]).ravel() + 2.0 * np.eye(6, k=4).ravel()), rotor=0.0002,
     sensor=(0.01, (0.3, 0.0, 0.0)), com=(0.0, 0.0, -0.004),
 )  # fmt: skip
-"""uuvsimulator/lauv_gazebo, commit 3529e02, with damping by forward speed, which it leaves at 0, and a lower centre."""
+"""uuvsimulator/lauv_gazebo, commit 3529e02, with damping by forward speed, which is 0 there, and a lower
+centre."""
 SAGA = Robot(
     "saga", 10.0, (0.27, 0, 0, 0.56, 0, 0.52), list(np.diag([1.7182, 0, 5.468, 0, 1.2481, 0.4006]).ravel()),
     [-11.7391, -20, -31.8678, -25, -44.9085, -5], [0.0] * 6, 0.011054, (0, 0, 0.155), (0.2384, 0.448, 0.28066),
@@ -77,7 +78,7 @@ SAGA = Robot(
 
 
 def text(robot, **changes):
-    """The xacro of a robot; `changes` are of its numbers."""
+    """Return the xacro of a robot; `changes` replace its numbers."""
     m = replace(robot, **changes)
     row = lambda values: " ".join(repr(float(x)) for x in values)  # noqa: E731
     ixx, ixy, ixz, iyy, iyz, izz = m.inertia
@@ -177,7 +178,8 @@ class Origin(gz_sim.Origin):
         self.inverse = np.linalg.inv(self.rigid + at_centre @ turn @ self.Ma @ turn)
 
     def rate(self, R, nu, tau):
-        """Acceleration of many states: rotation body to world (n, 3, 3), velocity (n, 6), wrench (n, 6)."""
+        """Return the acceleration of many states: rotation body to world (n, 3, 3), velocity (n, 6), wrench
+        (n, 6)."""
         up = R[:, 2, :]
         momentum = nu @ self.rigid.T
         wrench = tau + np.hstack(

@@ -17,7 +17,7 @@ class Flow:
 
 
 def flow(water, gravity, position, t):
-    """The flow of a `finssim.sim.Water` without drift, still above z = 0 as at z = 0.
+    """Return the flow of a `finssim.sim.Water` without drift; above z = 0 it is that at z = 0.
 
     θ = k·x - ω t + φ0,  ∇φ = velocity,  ∂∇φ/∂t = acceleration,  η = A cos θ.
     """

@@ -1,4 +1,4 @@
-"""Views of a board that a known lens would take, and OpenCV's photographs of one."""
+"""Views of a board through a known lens, and OpenCV's photographs of a board."""
 
 from functools import cache
 from pathlib import Path
@@ -25,7 +25,7 @@ LENSES = {
 
 
 def views(lens, count, rng, *, noise=0.15, tilt=0.7, reach=0.75):
-    """Boards all over the picture, tilted each way by up to `tilt` [rad]."""
+    """Return boards all over the picture, tilted in all directions by up to `tilt` [rad]."""
     found = []
     while len(found) < count:
         roll, pitch, yaw = rng.uniform(-tilt, tilt), rng.uniform(-tilt, tilt), rng.uniform(-0.4, 0.4)
@@ -53,7 +53,7 @@ def views(lens, count, rng, *, noise=0.15, tilt=0.7, reach=0.75):
 
 @cache
 def photographed():
-    """OpenCV's 13 photographs, 9x6 corners of 25 mm."""
+    """Return OpenCV's 13 photographs, 9x6 corners of 25 mm."""
     board = Board(columns=9, rows=6, square=0.025)
     found = []
     for _, name, image in pictures(PHOTOGRAPHS, notify=lambda words: None):

@@ -44,7 +44,7 @@ MOUNTS = {
         quat_to_matrix(quat_from_euler(-0.01, 0.02, np.pi / 2 + 0.03)), np.array([-0.07, -0.003, 0.098])
     ),
 }
-"""Where the tags are, in the body."""
+"""Poses of the tags in the body."""
 
 
 @dataclass
@@ -55,7 +55,7 @@ class Motion:
     position: np.ndarray
     quaternion: np.ndarray
     at: Callable
-    """The same motion at other times."""
+    """Function that returns the same motion at other times."""
 
     def depth(self, port=PORT):
         """Return the depth of the port below the surface [m]."""
@@ -119,7 +119,7 @@ def write_log(
     gyro_bias=(0.01, -0.006, 0.004),
     clock=0.0,
 ):
-    """A log folder: detections, an IMU of 50 Hz in its own axes, depth of 10 Hz."""
+    """Write a log folder: detections, an IMU of 50 Hz in its own axes, depth of 10 Hz."""
     folder.mkdir(exist_ok=True)
     frames = [
         Frame(
@@ -134,14 +134,14 @@ def write_log(
     fine = moved.at(t)
     turned = quat_multiply(quat_conjugate(fine.quaternion[:-1]), fine.quaternion[1:])
     rate = np.vstack([quat_to_rotvec(turned), np.zeros((1, 3))])[[*range(len(t) - 1), len(t) - 2]] / 0.02
-    # A rate over the step ahead belongs to its middle.
+    # A rate over the next step belongs to its middle.
     sensor = quat_inverse_rotate(np.array(imu_orientation), rate) + np.array(gyro_bias)
     force = quat_inverse_rotate(np.array(imu_orientation), 9.81 * fine.up)
     columns = {"t": t + 0.01 - clock}
     for name, values, std in (("gyro", sensor, 0.003), ("accel", force, 0.02)):
         noisy = values + std * rng.standard_normal(values.shape)
         columns |= {f"{name}_{axis}": noisy[:, i] for i, axis in enumerate("xyz")}
-    if attitude:  # of the sensor, as what is in its axes is
+    if attitude:  # acceleration of the sensor, in its own axes
         wobble = quat_from_rotvec(0.004 * rng.standard_normal((len(t), 3)))
         q = quat_multiply(moved.at(t + 0.01).quaternion, quat_multiply(wobble, imu_orientation))
         columns |= {f"q{axis}": q[:, i] for i, axis in enumerate("xyzw")}

@@ -52,7 +52,7 @@ def test_intervals_hold_the_truth_nineteen_times_of_twenty():
 
 
 def test_the_minimum_is_opencvs():
-    """On the same corners, noise without outliers, both find the same lens."""
+    """On the same corners, with noise and without outliers, both fits give the same lens."""
     lens = LENSES["plumb_bob"]
     seen = views(lens, 12, np.random.default_rng(5), noise=0.05)
     bundle = adjust(seen, "plumb_bob")
@@ -65,10 +65,10 @@ def test_the_minimum_is_opencvs():
 
 
 def test_opencvs_chessboards_give_the_published_lens():
-    """fx within 1 % of the published 535.9 px, and all 13 pictures are good.
+    """fx is within 1 % of the published 535.9 px, and all 13 pictures are good.
 
-    The published fit has a picture, left02, at 1.18 px: its squares are small, and the window that refined its corners
-    took in their neighbours. With windows that fit the squares it is as good as the others.
+    In the published fit one picture, left02, has 1.18 px: its squares are small, and the window that refined its corners
+    included their neighbours. With windows that fit the squares it is as good as the others.
     """
     fit = calibrate_camera(photographed())
     published = load_camera(PHOTOGRAPHS / "left_intrinsics.yml").lens
@@ -86,7 +86,7 @@ def test_opencvs_chessboards_give_the_published_lens():
 
 
 def test_published_distortion_bends_pixels_as_ours_where_corners_were_seen():
-    """Coefficients go together; what they do to a pixel, with the turn of the camera free, agrees to 2 px.
+    """Coefficients are correlated; the displacement of pixels, with a free camera rotation, agrees to 2 px.
 
     Focal lengths differ by 0.5 %, which is 1.5 px at the edge.
     """

@@ -1,4 +1,4 @@
-"""Bundles of apriltag_ros as a survey, and detections whose corners other programs list in another order."""
+"""Bundles of apriltag_ros as a survey, and detections with other orders of corners."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ PLACES = {
 
 
 def bundle():
-    """Return the layout as apriltag_ros has it."""
+    """Return the layout in the format of apriltag_ros."""
     rows = []
     for tag, ((x, y, z), angles, edge) in PLACES.items():
         qx, qy, qz, qw = (float(value) for value in quat_from_euler(*angles))
@@ -62,7 +62,7 @@ ORDERS = {
 
 @pytest.mark.parametrize("name", ORDERS)
 def test_any_order_of_corners_is_recognised_where_two_tags_are_seen(name):
-    """The eight orders that go round a square; the sentence names the file's first two corners."""
+    """Eight orders run along a square's edges; the message names the file's first two corners."""
     frames, remark = in_our_order(pictures(ORDERS[name]), surveyed())
     expected = pictures(ORDERS["ours"])[0]
     for ours, theirs in zip(expected.detections, frames[0].detections, strict=True):
@@ -73,14 +73,14 @@ def test_any_order_of_corners_is_recognised_where_two_tags_are_seen(name):
 
 
 def test_a_single_tag_says_nothing_about_the_first_corner():
-    """It stays as it is, and so do tags that no survey has."""
+    """Its corners stay unchanged, and so do those of tags without a survey."""
     for tags in ((2,), ()):
         given = pictures(ORDERS["top-right first"], tags)
         assert in_our_order(given, surveyed()) == (given, "")
 
 
 def test_a_bundle_and_detections_of_its_detector_give_the_pool(tmp_path):
-    """The camera's place comes back, of corners in the order of the AprilTag library."""
+    """The camera position is recovered from corners in the order of the AprilTag library."""
     (tmp_path / "tags.yaml").write_text(bundle(), encoding="utf-8")
     (tmp_path / "survey.yaml").write_text(
         "points: tags.yaml\nsigma: 0.001\nsurface: {height: 1.0, sigma: 0.002}\nfit: [pose]\n",
@@ -96,7 +96,7 @@ def test_a_bundle_and_detections_of_its_detector_give_the_pool(tmp_path):
 
 
 def test_sizes_without_poses_are_edges_of_a_table(tmp_path):
-    """Settings of ROS 2 give the edge by id, and the family; alone they are no survey."""
+    """Settings of ROS 2 give the edge by id, and the family; alone they are not a survey."""
     settings = tmp_path / "settings.yaml"
     settings.write_text("/**: {ros__parameters: {family: 36h11, tag: {ids: [7, 8], sizes: [0.2, 0.1]}}}\n")
     with pytest.raises(

@@ -28,7 +28,7 @@ def degrees_between(a, b):
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory):
-    """A pool, and FinsROV with the port where the moving vehicle has it."""
+    """Pool, and FinsROV with the port of the moving vehicle."""
     folder = tmp_path_factory.mktemp("mounts")
     write_pool(POOL, folder / "pool.yaml")
     vehicle = load_vehicle("finsrov").replace(
@@ -40,7 +40,7 @@ def place(tmp_path_factory):
 
 @pytest.mark.slow
 def test_tags_are_written_where_they_are(place, capsys):
-    """The IMU and the port are right in the file; the tags move to where they are, with intervals as their notes."""
+    """The file's IMU and port are right; the tags move to their true mounts, with intervals as notes."""
     write_log(place / "rocked", motion(), np.random.default_rng(1))
     after = run(
         place / "rocked",

@@ -105,7 +105,7 @@ def test_a_wrong_tape_is_contradicted():
 
 @pytest.mark.slow
 def test_dry_points_help():
-    """Markers above the water fix the camera: the water's height is told half as exactly again as without."""
+    """Markers above the water fix the camera: the interval of the water's height shrinks by a third."""
     camera = overhead()
     wet = survey(camera, WATER, FLOOR, 40)
     points = np.random.default_rng(2).uniform((-0.8, -0.4, 1.02), (0.8, 0.3, 1.3), (12, 3))
@@ -131,7 +131,7 @@ def test_dry_points_help():
 @pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.7, 1.4])
 def test_a_guessed_focal_length_is_enough(factor):
-    """Points at many depths give the focal length back within 2 % from a guess 30 or 40 % off."""
+    """Points at many depths recover the focal length within 2 % from a guess 30 or 40 % off."""
     guess = Lens(1280, 720, 541.0 * factor, 541.0 * factor, 640.0, 360.0, "plumb_bob", ())
     seen = survey(overhead(), WATER, SOLID, 80)
     fit = calibrate_pool(seen, guess, PoolFitSettings(water_height=1.0, focal_sigma=0.3))
@@ -143,7 +143,7 @@ def test_a_guessed_focal_length_is_enough(factor):
 
 
 def rim(camera, count=8):
-    """Marks above the water as `survey` gives those under it, seen in straight lines."""
+    """Return markers above the water, seen in straight lines, in the form of `survey`."""
     rng = np.random.default_rng(2)
     points = rng.uniform((-0.8, -0.4, 1.02), (0.8, 0.3, 1.3), (count, 3))
     pixels, ok = camera.lens.project((points - camera.position) @ camera.R_pc)
@@ -166,7 +166,8 @@ def test_marks_above_the_water_are_told_from_wrong_rows():
 
 
 def test_points_without_water_are_noticed():
-    """Pixels of points in air, calibrated as a tank: straight lines foretell them better, and that comes first."""
+    """For pixels of points in air, calibrated as a tank, straight lines predict better; this finding comes
+    first."""
     camera = before_tank(30.0)
     points = survey(camera, window(), TANK, 60, error=0.0).points
     pixels, _ = camera.lens.project((points - camera.position) @ camera.R_pc)
@@ -200,8 +201,10 @@ def test_centimetres_for_metres_are_refused(option, value):
 
 @pytest.mark.parametrize(("pixels", "refused"), [(4.0, False), (30.0, True)])
 def test_a_camera_on_the_plane_with_large_residuals_is_doubted(pixels, refused):
-    """A sound calibration moved on to its plane: 4 px are doubted, 30 px refused, and 0.3 px are a camera at a
-    window."""
+    """With a sound calibration moved onto its plane, 4 px are questioned and 30 px refused.
+
+    0.3 px are accepted: a camera at a window.
+    """
     fit = calibrate_pool(
         survey(overhead(), WATER, FLOOR, 40), PLUMB_BOB, PoolFitSettings(fit=FIT, water_height=1.0)
     )
@@ -220,7 +223,7 @@ def test_a_camera_on_the_plane_with_large_residuals_is_doubted(pixels, refused):
 
 @pytest.mark.slow
 def test_a_flat_left_handed_survey_is_warned_of():
-    """Its y negated, a floor could as well have z down; the water's height or a second depth tells the two apart."""
+    """A floor with negated y could as well have z down; the water's height or a second depth decides."""
     turn = np.array([1.0, -1.0, 1.0])
     left = survey(overhead(), WATER, FLOOR, 40)
     left = replace(left, points=left.points * turn)
@@ -238,7 +241,8 @@ def test_a_flat_left_handed_survey_is_warned_of():
 @pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.94, 0.96])
 def test_a_lens_that_misfits_before_a_known_window_may_be_fitted(factor):
-    """Window and index known, the lens not: index or window gives way, and the advice says how to free the lens."""
+    """With window and index known and the lens not, index or window is fitted, and the advice says how to fit
+    the lens."""
     rough = replace(TANK_LENS, fx=TANK_LENS.fx * factor, fy=TANK_LENS.fy * factor)
     seen = survey(before_tank(30.0), window(), TANK, 60, error=0.0005)
     told = PoolFitSettings(fit=FIT, window=GLASS, plane=(0.0, 1.0, 0.0, 0.0), survey_sigma=0.0005)

@@ -1,4 +1,4 @@
-"""The command writes a pool file that gives the points back, says what it found, and refuses without writing."""
+"""The command writes a pool file that reproduces the points, reports findings, and refuses without writing."""
 
 import json
 from dataclasses import replace
@@ -32,14 +32,15 @@ def table(path, seen):
 
 
 def calibrated(folder, text="surface: {height: 1.0}", points="points.csv", out="pool.yaml", **options):
-    """Run the command with a survey file of that text on the files of a folder."""
+    """Run the command on the files of a folder, with a survey file of this text."""
     (folder / "survey.yaml").write_text(text, encoding="utf-8")
     files = {"survey": folder / "survey.yaml", "camera": folder / "camera.yaml", "out": folder / out}
     return run([folder / points], **{**files, **options})
 
 
 def test_a_pool_file_gives_held_out_points_back(pool):
-    """Points that the calibration never saw, back-projected to the floor: 3 mm, of which the survey is 3."""
+    """Points not used in the calibration, back-projected to the floor, agree to 3 mm, mostly due to the
+    survey."""
     calibrated(pool)
     found, fresh = (
         load_pool(pool / "pool.yaml"),
@@ -55,7 +56,8 @@ def test_a_pool_file_gives_held_out_points_back(pool):
 
 @pytest.mark.slow
 def test_the_lens_is_as_sure_as_its_file_remembers(pool):
-    """Intervals of `calibrate camera` become standard errors of focal length and centre; the survey file goes first."""
+    """Intervals of `calibrate camera` become standard errors of focal length and centre; the survey file
+    overrides them."""
     fx, cx = PLUMB_BOB.fx, PLUMB_BOB.cx
     ends = {"fx": [fx - 1.96, fx + 1.96], "cx": [cx - 3.92, cx + 3.92], "cy": [0.0, 0.0]}
     record = {
@@ -121,7 +123,7 @@ def test_parts_of_the_picture_are_no_pixels(pool):
     ["", "camera: {focal_sigma: 0.003}", "camera: {focal_sigma: 0.0}", "fit: [pose, height, focal]"],
 )
 def test_a_lens_taken_as_exact_is_said(pool, capsys, lens):
-    """As a note in the table and a finding in JSON, unless the survey file gives its errors or fits it."""
+    """A note in the table and a finding in JSON say so, unless the survey file gives its errors or fits it."""
     text = f"surface: {{height: 1.0}}\n{lens}"
     calibrated(pool, text)
     assert ("· the lens is assumed exact" in capsys.readouterr().out) == (not lens)
@@ -131,7 +133,7 @@ def test_a_lens_taken_as_exact_is_said(pool, capsys, lens):
 
 
 def test_the_surveys_part_of_the_held_out_error_is_said(pool, capsys):
-    """2 mm for each of two coordinates make 2.8 mm, times how much worse than said the survey seems."""
+    """2 mm for each of two coordinates give 2.8 mm, times the ratio of apparent to stated survey error."""
     fit = calibrated(pool)
     told = 0.2 * np.sqrt(2.0) * fit.noise.scale
     assert load_pool(pool / "pool.yaml").record["held_out"]["survey_cm"] == pytest.approx(told)

@@ -49,7 +49,8 @@ def test_noise_free_surveys_give_the_truth(lens, box):
 
 @pytest.mark.slow
 def test_published_geometry_with_a_tape():
-    """1.2 m above 1 m of water, 85 places, 2 mm of survey, 0.25 px, a tape of 2 mm (paper, table II)."""
+    """The geometry is 1.2 m above 1 m of water, 85 points, 2 mm of survey, 0.25 px, a tape of 2 mm (paper,
+    table II)."""
     camera, errors = overhead(), []
     for seed in range(6):
         seen = survey(camera, WATER, FLOOR, 160, seed, pixel=0.25, error=0.002)
@@ -67,7 +68,7 @@ def test_published_geometry_with_a_tape():
 
 @pytest.mark.slow
 def test_intervals_hold_the_truth():
-    """19 of 20 intervals hold it: of 6 surveys x 4 numbers, 20 or more do (binomial, 1 in 170 has fewer)."""
+    """95 % intervals: of 6 surveys x 4 numbers, 20 or more contain the truth (binomial, 1 in 170 has fewer)."""
     inside = 0
     for seed in range(6):
         rng = np.random.default_rng([5, seed])
@@ -82,7 +83,7 @@ def test_intervals_hold_the_truth():
 
 
 def test_z_down_is_a_frame_like_any_other():
-    """x forward, y right, z down: the water lies at negative z."""
+    """With x forward, y right, z down, the water lies at negative z."""
     camera, seen = overhead(), survey(overhead(), WATER, FLOOR, 60)
     down = replace(seen, points=seen.points * np.array([1.0, -1.0, -1.0]))
     fit = calibrate_pool(down, camera.lens, PoolFitSettings(fit=FIT, water_height=-1.0))
@@ -99,7 +100,7 @@ def test_a_left_handed_solid_is_refused():
 
 
 def test_a_left_handed_floor_contradicts_its_tape():
-    """A plane fits its mirror image, but then the camera is under it and the water is not."""
+    """A plane fits its mirror image, but then the camera is below it and the water is not."""
     seen = survey(overhead(), WATER, FLOOR, 40)
     mirrored = replace(seen, points=seen.points * np.array([1.0, -1.0, 1.0]))
     with pytest.raises(CalibrationError, match="other side.*negate y"):
@@ -151,8 +152,10 @@ def test_senseless_options_are_refused(options, words):
 
 @pytest.mark.slow
 def test_intervals_allow_for_a_lens_that_is_not_sure():
-    """Focal length off by 0.3 % and centre by 4 px: told so, the camera's place errs as its intervals say (95 % of the
-    squares of normalised errors below 1.96²); taken for exact, far more."""
+    """With stated lens errors of 0.3 % in focal length and 4 px in centre, intervals of the camera position are valid.
+
+    95 % of the squares of normalised errors are below 1.96²; far fewer are if the lens is taken as exact.
+    """
     camera, random = overhead(), np.random.default_rng(3)
     squares = {"told": [], "not told": []}
     for seed in range(12):
@@ -185,7 +188,8 @@ def test_intervals_allow_for_a_lens_that_is_not_sure():
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(6))
 def test_a_flat_floor_with_two_dry_marks_is_not_taken_for_left_handed(seed):
-    """Straight lines may fit the mirror image of such a survey better than the survey; bent ones fit the survey."""
+    """Straight rays may fit the mirror image of such a survey better than the survey; refracted ones fit the
+    survey."""
     random = np.random.default_rng(seed)
     camera = Camera(PLUMB_BOB, [1.0, -1.6, 5.3], [1.0, 0.0, 0.0, 0.0])
     floor = np.column_stack([random.uniform(-1.7, 3.2, 10), random.uniform(-3.1, 0.2, 10), np.zeros(10)])

@@ -1,4 +1,4 @@
-"""Tanks seen through a window of any direction."""
+"""Tanks seen through a window in any orientation."""
 
 from dataclasses import replace
 
@@ -43,7 +43,8 @@ def tilt_error(fit, plane):
 @pytest.mark.slow
 @pytest.mark.parametrize("degrees", [0.0, 20.0, 40.0])
 def test_points_behind_a_window(degrees):
-    """A vertical window at any angle to the camera, its plane unknown: held-out points to about a millimetre."""
+    """With a vertical window at any angle to the camera, its plane unknown, held-out points agree to about a
+    millimetre."""
     camera, plane = before_tank(degrees), window()
     seen = survey(camera, plane, TANK, 60, pixel=0.25, error=0.0005)
     fit = calibrate_pool(seen, camera.lens, PoolFitSettings(fit=FIT, window=GLASS, survey_sigma=0.0005))
@@ -86,7 +87,7 @@ def turned(turn):
 
 
 def boards(camera, plane, seed=5, nearest=0.02):
-    """Five boards behind one another, as far as they hang in the water, in their own frame."""
+    """Return five boards one behind the other, as far as they hang in the water, in their own frame."""
     rng = np.random.default_rng(seed)
     x, z = np.meshgrid(np.linspace(-0.12, 0.12, 6), np.linspace(0.1, 0.3, 5))
     layers = [np.column_stack([x.ravel(), np.full(x.size, y), z.ravel()]) for y in np.linspace(0.06, 0.4, 5)]
@@ -103,20 +104,20 @@ def told(**options):
 
 
 def tilt_sigma(fit):
-    """Standard error of the normal's direction that the calibration gives [degrees]."""
+    """Return the calibration's standard error of the normal's direction [degrees]."""
     names = [name for name in fit.estimates if name.startswith("normal")]
     return float(np.degrees(max((np.ptp(fit.estimates[name].ci95)) / 3.92 for name in names)))
 
 
 def noise():
-    """Residual that pixels and survey make by themselves at half a metre and more [px]."""
+    """Return the residual due to pixels and survey alone at half a metre and more [px]."""
     return np.sqrt(2.0) * np.hypot(PIXEL, SURVEY * TANK_LENS.fx / 0.7)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("turn", TURNS, ids=str)
 def test_a_window_turned_against_the_boards(turn):
-    """Which plane comes out does not hang on how near the first one tried comes to the nearest point."""
+    """The fitted plane does not depend on how near the first candidate comes to the nearest point."""
     camera, plane = before_tank(10.0), turned(turn)
     seen = boards(camera, plane)
     fit = calibrate_pool(seen, camera.lens, told(window=GLASS))
@@ -145,7 +146,7 @@ def test_rows_before_the_window_do_not_hold_it(turn):
 
 @pytest.mark.slow
 def test_a_plane_at_its_bound_is_told():
-    """A window stated far too thick leaves no room for the plane before the nearest board."""
+    """A window stated far too thick leaves no space for the plane before the nearest board."""
     camera, plane = before_tank(10.0), turned((12, -9))
     seen = boards(camera, plane, nearest=0.001)
     fit = calibrate_pool(seen, camera.lens, told(window=replace(GLASS, thickness=0.12)))

@@ -1,4 +1,4 @@
-"""Surveys are read as people write them, and what is missing or contradictory is named."""
+"""Surveys are read in common spellings, and missing or contradictory data are named."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ def written(folder, text):
     ],
 )
 def test_one_point_in_many_spellings(tmp_path, text):
-    """Case, order, separator, decimal comma and unit are the writer's."""
+    """Case, order, separator, decimal comma and unit are free."""
     survey = read_survey(written(tmp_path, text))
     np.testing.assert_allclose(survey.points["a"].points, [[1.5, -0.25, 0.5]])
 

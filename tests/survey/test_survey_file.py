@@ -1,4 +1,4 @@
-"""Survey files give the settings of the fit and the surveyed points, and what is wrong in them is named."""
+"""Survey files give the settings of the fit and the surveyed points, and errors in them are named."""
 
 import numpy as np
 import pytest
@@ -63,7 +63,7 @@ def test_a_window_and_its_plane(tmp_path):
 
 @pytest.mark.parametrize("text", ["surface: {}\n", "surface:\n"])
 def test_the_shortest_file_keeps_every_default(tmp_path, text):
-    """What the file leaves out is the caller's, or else that of `PoolFitSettings`."""
+    """Omitted keys have the caller's values, or else those of `PoolFitSettings`."""
     file = load_survey_file(written(tmp_path, text))
     assert file.fit_settings() == PoolFitSettings()
     assert file.fit_settings(focal_sigma=0.01).focal_sigma == 0.01
@@ -71,7 +71,7 @@ def test_the_shortest_file_keeps_every_default(tmp_path, text):
 
 
 def test_a_grid_of_tags(tmp_path):
-    """Turned by 90 degrees, the columns run along y; the second row lies at smaller x."""
+    """With a turn of 90 degrees, the columns run along y; the second row lies at smaller x."""
     tags = load_survey_file(written(tmp_path, f"surface: {{}}\ngrid: {GRID}\n")).grid
     assert sorted(tags) == [5, 6, 7, 8, 9, 10]
     np.testing.assert_allclose(tags[7].points.mean(axis=0), [1.0, 2.4, 0.0], atol=1e-12)

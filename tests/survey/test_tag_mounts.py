@@ -27,7 +27,7 @@ RIG = Rig(pool=POOL, edge=EDGE, port=PORT, reference=15)
 TRUTH = MountState(reference=MOUNTS[15], others={16: MOUNTS[15].inverse.then(MOUNTS[16])}, poses=[])
 LEVEL = quat_to_matrix(quat_from_euler(0.0, 0.0, np.pi / 2))
 FILE = {15: Pose(LEVEL, np.array([0.07, 0.0, 0.10])), 16: Pose(LEVEL, np.array([-0.07, 0.0, 0.10]))}
-"""As a vehicle file might have them: a centimetre and two degrees off."""
+"""Mounts of a vehicle file: a centimetre and two degrees off."""
 
 
 def errors(fit, names, truth=TRUTH):
@@ -45,7 +45,7 @@ def fitted(rocked):
 
 
 def test_derivatives_are_those_of_the_prediction(rocked, monkeypatch):
-    """Every column of the normal equations' right side against a numerical derivative of the cost."""
+    """Every column of the normal equations' right side equals a numerical derivative of the cost."""
     some = [replace(m, corners=dict(m.corners)) for m in rocked[:3]]
     state, _ = start_state(RIG, FILE, some)
     monkeypatch.setattr(mounts_fit, "PIXEL_STD", 1e3)  # no corner is far off
@@ -72,7 +72,8 @@ def test_derivatives_are_those_of_the_prediction(rocked, monkeypatch):
 
 @pytest.mark.slow
 def test_a_rocking_vehicle_tells_its_tags_whole(fitted):
-    """Relative to one another to tenths of a millimetre; in the body by the IMU's tilt and the depth."""
+    """Relative mounts are right to tenths of a millimetre; those in the body follow from the IMU's tilt and
+    the depth."""
     assert not fitted.frozen
     off = errors(fitted, fitted.free)
     for name, error in off.items():
@@ -105,7 +106,7 @@ def test_a_tag_glued_on_turned_is_found(quarter):
     fit = fit_mounts(RIG, {15: Pose(wrong, FILE[15].t)}, seen)
     off = errors(fit, ("reference.turn_z", "16.x", "16.y"))
     assert abs(np.degrees(off["reference.turn_z"])) < 1.5
-    assert max(abs(off["16.x"]), abs(off["16.y"])) < 1e-3  # placed though the file does not have it
+    assert max(abs(off["16.x"]), abs(off["16.y"])) < 1e-3  # included although the file lacks it
 
 
 @pytest.mark.slow
