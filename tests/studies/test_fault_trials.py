@@ -67,9 +67,9 @@ def test_a_full_disk_ends_the_record_and_not_the_trip(tried, caplog):
     ],
 )
 def test_what_befalls_an_autopilot_ends_as_its_page_says(tmp_path, monkeypatch, row, variant):
-    """The run ends in time for the stated reason; a manual pilot takes control, and an observer disturbs nothing.
+    """Each trial ends for its scenario's reason within its time limit, or stays armed if it must not end.
 
-    It is watched for at least 6 s, 4 s longer than the time in which it must end.
+    It is observed for at least 6 s, and for at least 4 s beyond its limit.
     """
     monkeypatch.setattr(faults, "WATCHED", 6.0)
     result = play(fault_job(row, variant, "moving", vehicle="bluerov2_heavy"), tmp_path / "trial")

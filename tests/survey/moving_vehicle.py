@@ -141,7 +141,7 @@ def write_log(
     for name, values, std in (("gyro", sensor, 0.003), ("accel", force, 0.02)):
         noisy = values + std * rng.standard_normal(values.shape)
         columns |= {f"{name}_{axis}": noisy[:, i] for i, axis in enumerate("xyz")}
-    if attitude:  # acceleration of the sensor, in its own axes
+    if attitude:  # attitude of the sensor, like the other readings in its axes
         wobble = quat_from_rotvec(0.004 * rng.standard_normal((len(t), 3)))
         q = quat_multiply(moved.at(t + 0.01).quaternion, quat_multiply(wobble, imu_orientation))
         columns |= {f"q{axis}": q[:, i] for i, axis in enumerate("xyzw")}

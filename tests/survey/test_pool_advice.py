@@ -105,7 +105,7 @@ def test_a_wrong_tape_is_contradicted():
 
 @pytest.mark.slow
 def test_dry_points_help():
-    """Markers above the water fix the camera: the interval of the water's height shrinks by a third."""
+    """Markers above the water fix the camera: the interval of the water's height shrinks by at least a third."""
     camera = overhead()
     wet = survey(camera, WATER, FLOOR, 40)
     points = np.random.default_rng(2).uniform((-0.8, -0.4, 1.02), (0.8, 0.3, 1.3), (12, 3))

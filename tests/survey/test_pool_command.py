@@ -39,8 +39,7 @@ def calibrated(folder, text="surface: {height: 1.0}", points="points.csv", out="
 
 
 def test_a_pool_file_gives_held_out_points_back(pool):
-    """Points not used in the calibration, back-projected to the floor, agree to 3 mm, mostly due to the
-    survey."""
+    """Error-free points not used in the calibration, back-projected to the floor, agree to 3 mm rms."""
     calibrated(pool)
     found, fresh = (
         load_pool(pool / "pool.yaml"),

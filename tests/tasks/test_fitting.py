@@ -82,7 +82,8 @@ def test_an_agent_may_use_all_of_finsrov_and_a_part_of_a_stronger_vehicle():
 
 
 def test_a_policy_says_what_its_actions_stand_for(tmp_path):
-    """Its description contains the share of the limits, and so does the robot's use of its actions."""
+    """The policy's description contains the share of the limits, and the action mode made from it uses this
+    share."""
     path = train(
         "t1",
         TrainingSettings(vehicle="bluerov2_heavy", worlds=16, steps=512),

@@ -88,7 +88,7 @@ def test_what_cannot_be_is_refused_in_one_sentence(old, new, sentence, tmp_path)
 
 
 def test_places_that_come_of_files_are_within_reach(tmp_path):
-    """Heights of a table, a slope over a wide bed and a scaled-up mesh stay within the limits of positions."""
+    """Table heights, a slope over a wide bed and a scaled-up mesh beyond the limits of positions are refused."""
     (tmp_path / "bed.csv").write_text("0,1\n-1e300,0\n")
     write_stl(tmp_path / "a.stl", 1e4 * np.eye(4, 3), [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)])
     for old, new, sentence in (

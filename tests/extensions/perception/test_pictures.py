@@ -144,7 +144,7 @@ def test_snow_covers_what_its_density_and_size_say(density, size, tmp_path):
 def test_water_types_give_what_is_not_given():
     """Omitted keys become Jerlov's K_d, and 1.5 times it for a beam; a given key is kept.
 
-    Blue decreases from the clearest type to the most turbid.
+    The attenuation of blue grows from the clearest type to the most turbid.
     """
     for name, K_d in JERLOV.items():
         water = WorldWater(jerlov=name, veil=[0.1, 0.2, 0.2])

@@ -232,7 +232,8 @@ def test_a_dvl_has_the_velocity_of_its_point_from_its_beams(scenes, poses):
 
 
 def test_a_dvl_locks_on_the_bottom_while_three_beams_reach_it(scenes, level):
-    """9 m over the floor no beam reaches it; another DVL may read the lock, and a mask leaves it unchanged."""
+    """9 m over the floor no beam reaches it; the lock can be shared with another DVL, and a mask leaves it
+    unchanged."""
     twists = wp.array(np.float32([[[0.5, 0, 0, 0, 0, 0]]]), dtype=vec6)
     lock = wp.full((1, 1), 1, dtype=int)
     sensor = DopplerBatch(scenes("floor"), dvl(), twists, lock=lock)

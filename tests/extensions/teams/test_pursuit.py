@@ -109,8 +109,7 @@ def test_at_the_speed_it_can_hold_a_vehicle_stays_level():
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", PREY_MODES)
 def test_every_prey_stays_in_its_range_and_below_its_speed(mode):
-    """Chased by lead pursuit for two minutes, it stays within 20 % while it turns and half a metre at the
-    border."""
+    """In two minutes of lead pursuit it exceeds its speed by at most 20 %, in turns, and its range by 0.5 m."""
     env = environment(hunted(mode, hold=1e9, time_limit=1e9), worlds=16)
     chaser = baseline("pursuit", "lead")
     observation, fastest = env.arrays.observation.numpy(), 0.0

@@ -88,7 +88,7 @@ def test_an_installed_node_refuses_a_missing_file_in_a_sentence(entry, lived, ca
 
 
 def test_a_recorder_without_a_pool_records(entry, lived, tmp_path):
-    """With pool_file:=none the recorder copies no file; a localizer without one has no work and reports that."""
+    """With pool_file:=none the recorder runs and copies no pool file."""
     record = tmp_path / "x.mcap"
     assert entry("recorder", "--ros-args", "-p", "pool_file:=none", "-p", f"record:={record}") == 0
     assert lived and record.exists()

@@ -116,7 +116,7 @@ def test_an_altimeter_tells_range_and_reach():
 
 
 def test_what_the_messages_of_own_sensors_tell_is_what_was_measured():
-    """Pictures, echoes and ranges are bit-identical; a missing reading gives None."""
+    """Pictures, echoes and ranges are bit-identical; an inconsistent ping and a NaN range give None."""
     for reading, key in zip(READINGS[:3], ("image", "sonar", "range"), strict=True):
         told = own_reading(made(reading)[key])
         for field in ("image", "ranges"):
