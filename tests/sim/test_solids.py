@@ -290,8 +290,8 @@ def test_boxes_around_a_vehicle_are_the_walls_of_a_pool(world):
 def test_thin_solids_hold(world, name):
     """A plate of 4 cm and, for a wide vehicle, struts of 3 cm stop vehicles at 1 m/s under full thrust.
 
-    A torpedo passes between two struts: at 4 kN/m the spring there absorbs 12 J, less than its energy. Its fins are left
-    out.
+    A torpedo passes between two struts: at 4 kN/m the spring there absorbs 12 J, less than its energy. Its fins are
+    omitted.
     """
     text = (
         "objects:\n  plate: {shape: box, position: [2.5, -20, -5], size: [0.04, 39, 7]}\n"

@@ -29,9 +29,9 @@ def test_nothing_runs_away_from_a_fast_turn(name, model):
     """From 3 m/s and 10 rad/s, 5 s in steps of 25 ms, all worlds run, with energy that weight and thrust can supply.
 
     In the undriven half of the worlds, errors never add as much energy as the greatest kinetic energy at the start:
-    h |ω| is 1/4, and damping would slow the stiffest axis fifty times in a substep. In the others, driven at 70 % of the
-    limits, speeds stay below 20 m/s plus the fall. A hull more than eight times as long as it is wide falls through the
-    surface within 25 ms, and is rolled by it: it has steps half as long.
+    h |ω| is 1/4, and damping would slow the stiffest axis fifty times in a substep. In the others, driven at 70 %
+    of the limits, speeds stay below 20 m/s plus the fall. A hull more than eight times as long as it is wide falls
+    through the surface within 25 ms, and is rolled by it: it has steps half as long.
     """
     vehicle = load(name)
     slim = max(vehicle.body.size) > 8.0 * min(vehicle.body.size)

@@ -67,8 +67,8 @@ def test_the_minimum_is_opencvs():
 def test_opencvs_chessboards_give_the_published_lens():
     """fx is within 1 % of the published 535.9 px, and all 13 pictures are good.
 
-    In the published fit one picture, left02, has 1.18 px: its squares are small, and the window that refined its corners
-    included their neighbours. With windows that fit the squares it is as good as the others.
+    In the published fit one picture, left02, has 1.18 px: its squares are small, and the window that refined its
+    corners included their neighbours. With windows that fit the squares it is as good as the others.
     """
     fit = calibrate_camera(photographed())
     published = load_camera(PHOTOGRAPHS / "left_intrinsics.yml").lens
