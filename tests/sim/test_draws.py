@@ -192,7 +192,7 @@ def test_waves_follow_the_given_one_on_the_dispersion_relation():
 
 
 def test_a_thruster_that_failed_gives_nothing():
-    """Thrusters fail independently; the remaining thrust is drawn too."""
+    """Thrusters fail independently with the given probability; a failed one gives no thrust."""
     parts = {"thrust": {"failure": {"uniform": [0.0, 0.0], "probability": 0.25}}}
     simulator, draws = draw(parts, worlds=500)
     gain = simulator.plant.gain.numpy()[:, 0]

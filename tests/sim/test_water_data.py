@@ -84,8 +84,7 @@ def test_a_profile_is_linear_between_its_rows_and_constant_beyond_them(table):
 
 
 def test_a_still_vehicle_is_carried_as_the_water_at_its_depth(tmp_path):
-    """After ten minutes it has moved with the profile at its depth, to a hundredth; a vehicle above moves
-    differently."""
+    """After ten minutes it moves with the profile at its depth, to 3 mm/s; a vehicle above moves differently."""
     (tmp_path / "p.csv").write_text("depth;east;north\n0;0,3;0\n10;0,1;0,2\n", encoding="utf-8")
     simulator = Simulator("finsrov", worlds=2, water=Water(current=tmp_path / "p.csv", depth=30.0))
     simulator.place(position=[[[0.0, 0.0, -2.0]], [[0.0, 0.0, -8.0]]])
