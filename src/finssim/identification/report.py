@@ -488,7 +488,7 @@ def _lead(fit: Fit) -> list[str]:
     """Return sentences about known and unknown parameters, and about the next dive."""
     known, unknown, given = list[str](), list[str](), list[str]()
     for name, e in fit.estimates.items():
-        if e.note.startswith("given"):
+        if e.note.startswith("given") or (not e.identifiable and e.ci95[0] == e.ci95[1]):
             given.append(f"{name} {number_text(e.estimate)} {e.unit}")
         elif not name.endswith(IMPLIED):
             half = 0.5 * (e.ci95[1] - e.ci95[0])
