@@ -625,7 +625,7 @@ def test_backproject_tells_the_error_of_points(points, capsys):
         (["backproject", "uv.csv", "--pool", "pool.yaml", "--z", "floor"], "Invalid value for '--z'"),
         (["backproject", "uv.csv", "--pool", "pool.yaml", "--z", "nan"], "'--z': nan is not a number"),
         (["backproject", "uv.csv", "--pool", "pool.yaml", "--z", "0", "--pixel-std", "0"], "positive number"),
-        (["backproject", "points.csv", "--pool", "pool.yaml", "--z", "0"], "column u is not there"),
+        (["backproject", "points.csv", "--pool", "pool.yaml", "--z", "0"], "column u is missing"),
         (["backproject", "bad.csv", "--pool", "pool.yaml", "--z", "0"], "bad.csv: line 3: v is 'low'"),
         (["backproject", "uv.csv", "--pool", "pool.yaml", "--z", "0", "--out", "."], "it is a directory"),
         (["backproject", "--pool", "pool.yaml", "--z", "0"], "Missing argument 'PIXELS'"),

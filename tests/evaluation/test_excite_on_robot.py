@@ -137,7 +137,7 @@ def test_what_cannot_be_is_refused_before_anything_is_opened(tmp_path, robot):
         {"safety.workspace_lower": [-0.5, -1.0, -1.0], "safety.workspace_upper": [0.5, 1.0, 0.0]}
     )
     write_vehicle(small, tmp_path / "small.yaml")
-    with pytest.raises(CalibrationError, match="to go along surge"):
+    with pytest.raises(CalibrationError, match="m of room along surge"):
         box = box_of(small)
         from finssim.evaluation.excitation import start_of
         from finssim.identification.programme import programmes

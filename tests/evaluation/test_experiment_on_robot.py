@@ -133,7 +133,7 @@ def test_a_trial_that_the_bridge_stops_counts_and_ends_an_unattended_session(tmp
     afterwards."""
     with (
         lockstep_pool(FINSROV, tmp_path / "pool.yaml", silent_from=12.0) as wiring,
-        pytest.raises(RobotError, match=r"pid, P02: stopped (the trial counts): no fresh telemetry"),
+        pytest.raises(RobotError, match=r"pid, P02: stopped \(the trial counts\): no fresh telemetry"),
     ):
         experiment(T1, tmp_path / "out", wiring, SETPOINTS)
     (played,) = (tmp_path / "out" / "trials").glob("*.json")

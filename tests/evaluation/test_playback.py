@@ -27,7 +27,7 @@ def test_an_episode_of_a_policy_is_filmed(tmp_path, monkeypatch):
     assert good and first.shape == (360, 640, 3) and first.std() > 5.0
     with pytest.raises(PlaybackError, match="give the film to write"):
         play(policy)
-    with pytest.raises(PlaybackError, match="no directory of a policy"):
+    with pytest.raises(PlaybackError, match="not a policy directory"):
         play(tmp_path / "run.mcap", film=FilmSettings(video=tmp_path / "run.mp4"))
     with pytest.raises(PlaybackError, match="--speed applies only to films"):
         play(tmp_path / "run.mcap", film=FilmSettings(speed=4.0))

@@ -168,7 +168,7 @@ def test_a_trajectory_is_measured_by_the_name_in_the_record(brief_straight, tmp_
     assert trial["p95_m"] < 0.08 and trial["success"]
     with pytest.raises(DriveError, match="the recorded goal moves"):
         read_record(record, "t1", FINSROV)
-    with pytest.raises(DriveError, match="'pursuit' has 2 vehicles and .* is of one"):
+    with pytest.raises(DriveError, match="'pursuit' has 2 vehicles but .* contains one"):
         read_record(record, "pursuit", FINSROV)
     with pytest.raises(DriveError, match="the recorded goal moves, but 'docking' expects a fixed goal"):
         read_record(record, "docking", FINSROV)
@@ -246,7 +246,10 @@ def test_a_record_moves_the_pipeline_as_a_whole_and_a_drawn_net_is_refused(held)
     ("words", "sentence"),
     [
         (["a.mcap", "pid"], "expected one controller"),
-        (["a.mcap", "--trials", "3", "--hydrodynamics", "mesh"], "leave --trials, --hydrodynamics out"),
+        (
+            ["a.mcap", "--trials", "3", "--hydrodynamics", "mesh"],
+            "--trials, --hydrodynamics: no effect on a record: omit them",
+        ),
         (["pid", "--truth", "m.csv"], "--truth is for records"),
     ],
 )

@@ -141,7 +141,7 @@ def test_a_fit_is_judged_by_what_was_not_fitted(tmp_path):
     told = lambda part, text: words.append((part, text))  # noqa: E731
     fit = fit_hydrodynamics(slow, vehicle, progress=told)
     assert not {"replays_worse"} & {one.code for one in fit.findings}
-    assert words[0][0] <= words[-1][0] <= 1.0 and any("judging" in text for _, text in words)
+    assert words[0][0] <= words[-1][0] <= 1.0 and any("validating" in text for _, text in words)
     figures = fit.quality["yaw"]
     assert 0.0 < figures["held_out"] < 0.3 * figures["file"]
     (drag,) = (path for path in fit.changes if "quadratic_damping" in path)
@@ -217,7 +217,7 @@ def test_published_numbers_are_data(joystick, by_sticks):
     assert np.diff(after.ci95)[0] < 0.9 * np.diff(before.ci95)[0]
     assert fit.settings["published"] == {"bollard_pull": pull, "top_speed": 1.25}
     said = " ".join(_remarks(replay([t for t in held if t.name == "surge_060"], calibrated(fit))))
-    assert "surge reaches 0.79 m/s, the fitted trials 0.4" in said and "extrapolated" in said
+    assert "surge reaches 0.79 m/s, the fitted trials reach 0.4" in said and "extrapolated" in said
     yaw = [t for t in fitted if t.name.startswith("yaw")]
     told = [replace(t, header=t.header.model_copy(update={"voltage": 15.0})) for t in yaw]
     with pytest.raises(CalibrationError, match="but the fitted axes are yaw"):

@@ -371,7 +371,8 @@ def evaluate_in_plants(
     unheeded += ["--plant"] if tuple(plant) != ("nominal",) and plant != "nominal" else []
     unheeded += ["--hydrodynamics"] if hydrodynamics != "calibrated" else []
     if records and unheeded:
-        raise EvaluationError(f"{', '.join(unheeded)} has no effect on a record: omit it")
+        options = "it" if len(unheeded) == 1 else "them"
+        raise EvaluationError(f"{', '.join(unheeded)}: no effect on a record: omit {options}")
     if truth is not None and not records:
         raise EvaluationError("--truth is for records: a simulation has its own truth")
     task, vehicle = _subject(Path(names[0]), task, vehicle)

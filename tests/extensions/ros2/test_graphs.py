@@ -167,7 +167,7 @@ def test_every_option_of_a_node_is_a_parameter_of_it():
         ("pool", {"bind": "here"}, Ros2Error, "ADDRESS:PORT"),
         ("robot", {"site": "open-water", "let_in": "here"}, GoalError, "two numbers x,y"),
         ("sim", {"goal": "9,9,-9,0"}, GoalError, "outside the workspace"),
-        ("sim", {"goal": "0,0,-0.5,0", "trajectory": "helix"}, GoalError, "not both"),
+        ("sim", {"goal": "0,0,-0.5,0", "trajectory": "helix"}, GoalError, "both are given"),
         ("sim", {"plant": "3"}, Ros2Error, "--plant has no effect in the graph sim"),
         ("robot", {"pool_file": FILE, "positioning": "usbl"}, Ros2Error, "--positioning has no effect"),
         ("pool", {"message_loss": 0.5}, Ros2Error, "for the messages of a team: give --team"),
