@@ -486,8 +486,7 @@ def _next(address: tuple[str, int]) -> tuple[str, int]:
 
 def _print_plant(plan: PoolPlan, files: PoolFiles) -> None:
     spec = plan.spec
-    drawn = "" if spec.severity in spec.title else f", {spec.severity}, seed {spec.seed}"
-    _print(f"plant: {spec.title}{drawn}")
+    _print(f"plant: {spec.title}, {spec.severity}, seed {spec.seed}")
     if plan.camera is not None:
         s = plan.camera.settings
         _print(
