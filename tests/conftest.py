@@ -5,9 +5,8 @@ import signal
 
 # Before any numeric library starts: OpenMP on busy cores slows torch tens of times.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
-if (
-    "PYTEST_XDIST_WORKER" in os.environ
-):  # as many processes as processors: further threads would wait for each other
+if "PYTEST_XDIST_WORKER" in os.environ:
+    # As many processes as processors: further threads would wait for each other.
     os.environ.setdefault("FINSSIM_THREADS", "1")
 
 import gc

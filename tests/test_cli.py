@@ -162,9 +162,8 @@ def test_an_interrupted_training_leaves_a_policy(tmp_path):
     run = subprocess.Popen([sys.executable, "-m", "finssim", *words], stderr=subprocess.PIPE, text=True)
     seen = next(line for line in run.stderr if "training" in line)
     run.send_signal(signal.SIGINT)
-    again = threading.Timer(
-        20.0, run.send_signal, (signal.SIGINT,)
-    )  # Python drops an interruption that arrives in a destructor
+    # Python drops an interruption that arrives in a destructor.
+    again = threading.Timer(20.0, run.send_signal, (signal.SIGINT,))
     again.start()
     said = seen + run.stderr.read()
     again.cancel()

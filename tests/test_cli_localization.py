@@ -441,9 +441,8 @@ def test_fuse_as_json(files, tmp_path, capsys):
     assert found["out"] == str(tmp_path / "fused.csv")
     assert found["accepted"]["vision"] > 20 and found["errors"]["fresh"]["rms_x"] < 0.02
     assert sum(found["states"].values()) == pytest.approx(1.0)
-    assert (
-        0.1 < found["nis_per_dimension"]["vision"] < 1.5
-    )  # the corners are better than their nominal 0.5 px
+    # The corners are better than their nominal 0.5 px.
+    assert 0.1 < found["nis_per_dimension"]["vision"] < 1.5
     assert found["health"]["vision_mode"] == "fresh"
 
 

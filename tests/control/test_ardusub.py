@@ -93,9 +93,8 @@ def test_thrusts_are_those_of_the_speed_controller():
             np.clip(t.thrust(t.shaft_speed(pulse, voltage)), t.force_min, t.force_max)
             for t, pulse in zip(vehicle.thrusters.values(), pulses, strict=True)
         ]
-        np.testing.assert_allclose(
-            f, expected, atol=0.02
-        )  # thrust is interpolated linearly in a table with 1 µs spacing
+        # Thrust is interpolated linearly in a table with 1 µs spacing.
+        np.testing.assert_allclose(f, expected, atol=0.02)
 
 
 @pytest.mark.parametrize("vehicle", [HEAVY, ROV], ids=lambda v: v.name)

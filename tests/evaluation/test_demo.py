@@ -55,9 +55,8 @@ def made(brief_steps, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stderr(told):
         patch.setattr(demo_module, "identify", lambda *a, **k: found.append(identify(*a, **k)) or found[0])
         patch.setattr(demo_module, "FULL", SMALL)
-        patch.setattr(
-            demo_module, "running", lambda *_: contextlib.nullcontext()
-        )  # compile the kernels first
+        # Compile the kernels first.
+        patch.setattr(demo_module, "running", lambda *_: contextlib.nullcontext())
         assert boundary.run(app, ["demo", "--steps", "8192", "--seed", "1", "--out", str(out)]) == 0
     return out, found[0], told.getvalue()
 

@@ -108,9 +108,8 @@ def test_errors_of_a_campaign_have_the_stated_spread():
     assert np.abs(errors.std(axis=0) / stated - 1.0).max() < 4.0 / np.sqrt(2 * len(drawn))
     assert (np.abs(errors.mean(axis=0)) / stated).max() < 4.0 / np.sqrt(len(drawn))
     assert all(one.lens.fx == one.lens.fy + (lens.fx - lens.fy) for one in drawn)
-    assert all(
-        one.truth.camera.lens == lens for one in drawn
-    )  # the camera is as given; its file has the error
+    # The camera is as given; its file has the error.
+    assert all(one.truth.camera.lens == lens for one in drawn)
 
 
 @pytest.mark.parametrize("name", [f.name for f in dataclasses.fields(Conditions)])

@@ -54,9 +54,8 @@ def test_an_oscillation_has_the_rms_of_a_sine():
     assert measures["e_p_m"] == pytest.approx(math.hypot(A / math.sqrt(2), 0.02), rel=late)
     assert measures["e_psi_deg"] == pytest.approx(8.0 / math.sqrt(2), rel=late)
     assert measures["success"] and measures["t_s_s"] == 0.0
-    assert measures["J_p_m"] == pytest.approx(
-        A / math.sqrt(2), rel=2 * late
-    )  # the constant 2 cm do not count as jitter
+    # The constant 2 cm do not count as jitter.
+    assert measures["J_p_m"] == pytest.approx(A / math.sqrt(2), rel=2 * late)
     assert measures["J_psi_deg"] == pytest.approx(8.0 / math.sqrt(2), rel=2 * late)
 
 

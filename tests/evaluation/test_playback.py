@@ -1,4 +1,4 @@
-"""`finssim play`: records are printed, policies are filmed; and the pictures of the onlooker's camera."""
+"""`finssim play`: records are printed, policies are filmed; and the pictures of the chase camera."""
 
 from dataclasses import replace
 
@@ -33,13 +33,13 @@ def test_an_episode_of_a_policy_is_filmed(tmp_path, monkeypatch):
         play(tmp_path / "run.mcap", film=FilmSettings(speed=4.0))
 
 
-def test_the_onlooker_sees_the_vehicle_ahead_of_it_wherever_that_is():
+def test_the_chase_camera_shows_the_vehicle_ahead_of_it_wherever_that_is():
     """FinsROV's orange float is in the middle of the picture, in T1's basin and in front of the dock."""
     for task in (replace(StationKeeping(), time_limit=1.0), make("camera-docking").task):
         env = Environment(task, worlds=2, seed=3)
-        onlooker = described_world("pool").onlooker(env, 1, width=320)
+        camera = described_world("pool").chase_camera(env, 1, width=320)
         for _ in range(2):
-            picture = onlooker.picture().astype(float)
+            picture = camera.picture().astype(float)
             orange = picture[..., 0] - picture[..., 2] > 25.0
             rows, columns = np.nonzero(orange)
             assert (

@@ -237,9 +237,8 @@ def test_a_vehicle_that_lies_tilted_keeps_its_tilt():
     arm = buoyancy * np.array(
         [moved["body.center_of_buoyancy.0"] - 0.01, moved["body.center_of_buoyancy.1"], k / buoyancy]
     )
-    moment = np.cross(
-        arm, [0.0, 0.0, 1.0]
-    )  # level: the moment that b subtracts on the left side of the equation
+    # Level: the moment that b subtracts on the left side of the equation.
+    moment = np.cross(arm, [0.0, 0.0, 1.0])
     np.testing.assert_allclose(moment[:2], [-tilts["roll.bias"], -tilts["pitch.bias"]], atol=1e-12)
     unsure = {"roll.bias": replace(found["roll.bias"], ci95=(-0.1, 0.5))}
     assert trim(unsure, buoyancy, (0.0, 0.0, 0.05)) == {}

@@ -63,9 +63,8 @@ def test_the_average_over_shapes_holds_what_the_data_cannot_exclude():
     """If only the force at one speed is known, all shapes contribute; where shapes are distinguishable, only
     one does."""
     top, size = 0.25, 80.0
-    drag = np.array(
-        [25.0, 18.0]
-    )  # a vehicle whose stronger trials give 13 and 87: 29.5 at 0.25 m/s, not 34.8
+    # A vehicle whose stronger trials give 13 and 87: 29.5 at 0.25 m/s, not 34.8.
+    drag = np.array([25.0, 18.0])
     across, along = np.array([1.0, top]), np.array([top, -1.0])
     S = 1.5**2 * np.outer(across, across) + 14.0**2 * np.outer(along, along)
     value, ends, weights, _ = _average(drag, WIDER**2 * S, size, top)

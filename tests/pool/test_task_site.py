@@ -47,9 +47,8 @@ SEEDS = {"camera-docking": 4, "pipeline": 2, "gate": 4, "pursuit": 11, "formatio
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "name", [name for name in TASKS if name != "velocity6"]
-)  # commands exist in training alone
+# Commands exist in training alone.
+@pytest.mark.parametrize("name", [name for name in TASKS if name != "velocity6"])
 def test_the_baseline_of_every_task_succeeds_through_the_stack(name):
     """The task itself scores the true state; no vehicle is stopped, and all decide at the task's rate."""
     (who, *_), task = baselines_of(name), task_named(name)

@@ -43,9 +43,8 @@ class Fossen(Origin):
         wrench (n, 6)."""
         out, inverse = [], np.linalg.inv(self.M_RB + self.M_A)
         for turn, v, push in zip(R, nu * F, tau * F, strict=True):
-            down = np.array(
-                [-turn[2, 0], turn[2, 1], turn[2, 2]]
-            )  # the world's z axis, in body axes with z down
+            # The world's z axis, in body axes with z down.
+            down = np.array([-turn[2, 0], turn[2, 1], turn[2, 2]])
             total = push + np.concatenate([(self.W - self.B) * down, self.arm @ down]) - self.drag(v)
             total -= (coriolis(self.M_RB, v) + self.added_coriolis(v)) @ v
             out.append(inverse @ total * F)

@@ -168,9 +168,8 @@ def test_current_and_drift_are_written_on_top_of_what_is_given():
     np.testing.assert_allclose(simulator.water.drift_time.numpy(), time, rtol=1e-6)
     simulator.step()
     drift = simulator.water.drift.numpy()[:, :2] / np.maximum(deviation, 1e-9)[:, None]
-    assert drift.std() == pytest.approx(
-        1.0, abs=0.15
-    )  # the first value is normal with this standard deviation
+    # The first value is normal with this standard deviation.
+    assert drift.std() == pytest.approx(1.0, abs=0.15)
 
 
 def test_waves_follow_the_given_one_on_the_dispersion_relation():

@@ -40,9 +40,8 @@ def test_a_sine_without_noise_and_its_slope(rate):
     t = times(rate)
     at = np.linspace(1.0, 13.0, 301)
     s = smooth(t, np.sin(1.5 * t)[:, None], at, order=3)
-    h = (
-        1.5 / rate
-    )  # error of the cubic spline: h⁴ in the value and h³ in the slope, with margin for the jitter
+    # Error of the cubic spline: h⁴ in the value and h³ in the slope, with margin for the jitter.
+    h = 1.5 / rate
     np.testing.assert_allclose(s.value[:, 0], np.sin(1.5 * at), atol=0.2 * h**3 + 1e-6)
     np.testing.assert_allclose(s.slope[:, 0], 1.5 * np.cos(1.5 * at), atol=0.6 * h**2 + 1e-5)
 

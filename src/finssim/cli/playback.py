@@ -100,9 +100,9 @@ def _film(path: Path, film: FilmSettings) -> None:
     environment = load_plant(film.plant).environment(agent, the_task, body, seed=film.seed, auto_reset=False)
     with atomic_write(video) as temporary, progress_bar("episode") as show:
         steps = round(the_task.time_limit / the_task.control_step)
-        onlooker, pictures = described_world("pool").onlooker(environment), []
+        camera, pictures = described_world("pool").chase_camera(environment), []
         for k, step in rollout(agent, environment, steps, lambda t: goals_in(environment)):
-            pictures.append(_with_observed(onlooker.picture(), environment))
+            pictures.append(_with_observed(camera.picture(), environment))
             show(k / steps)
             if step is not None and (step.terminated[0] or step.truncated[0]):
                 break

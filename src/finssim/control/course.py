@@ -256,13 +256,13 @@ def place_of(surge: float, by_pitch: int, vehicle: int, data: CourseData) -> Pla
 
 
 @wp.func
-def heading_error(order: CourseReference, level: LevelMotion, vehicle: int, data: CourseData) -> float:
+def heading_error(reference: CourseReference, level: LevelMotion, vehicle: int, data: CourseData) -> float:
     """Return the heading minus the one that achieves the requested course in the current [rad]; not wrapped."""
     least = data.first[vehicle]
     course = float(level.heading)
     if wp.dot(level.way, level.ahead) > 0.5 * least:
         course = wp.atan2(level.way[1], level.way[0])
-    course += order.turn
+    course += reference.turn
     drift = wp.dot(level.current, wp.vec2(-wp.sin(course), wp.cos(course))) / wp.max(level.surge, least)
     greatest = wp.static(math.sin(MOST_CRAB))
     return level.heading - course + wp.asin(wp.clamp(drift, -greatest, greatest))
@@ -270,12 +270,12 @@ def heading_error(order: CourseReference, level: LevelMotion, vehicle: int, data
 
 @wp.func
 def errors_of(
-    order: CourseReference, q: wp.quat, nu: vec6, memory: Memory, off: float, reach: Wrench4
+    reference: CourseReference, q: wp.quat, nu: vec6, memory: Memory, off: float, reach: Wrench4
 ) -> Row:
     """Return the state in the feedback, and the lagged wrench [m/s, rad/s, rad, m, N, N m].
 
     Args:
-        order: Reference, as for `steer`.
+        reference: Reference, as for `steer`.
         q: Attitude, body to world.
         nu: Velocity over ground, body frame [m/s, rad/s].
         memory: Memory after the previous command [m, rad s, N, N m, m/s].
@@ -288,11 +288,11 @@ def errors_of(
         x[i] = nu[i]
     x[1] = memory[7]
     x[2] = memory[8]
-    x[0] = wp.clamp(nu[0] - order.speed, -reach[0], reach[0])
+    x[0] = wp.clamp(nu[0] - reference.speed, -reach[0], reach[0])
     x[6] = wp.atan2(up[1], up[2])
-    x[7] = wp.clamp(wp.asin(wp.clamp(-up[0], -1.0, 1.0)) - order.pitch, -reach[1], reach[1])
+    x[7] = wp.clamp(wp.asin(wp.clamp(-up[0], -1.0, 1.0)) - reference.pitch, -reach[1], reach[1])
     x[8] = wp.clamp(wp.atan2(wp.sin(off), wp.cos(off)), -reach[2], reach[2])
-    x[9] = wp.clamp(-order.rise, -reach[3], reach[3])
+    x[9] = wp.clamp(-reference.rise, -reach[3], reach[3])
     for i in range(3):
         x[10 + i] = memory[i]
     for i in range(4):
@@ -317,7 +317,13 @@ def demanded(speed: float, x: Row, at: Place, vehicle: int, data: CourseData) ->
 
 @wp.func
 def grown_integrals(
-    order: CourseReference, x: Row, short: Wrench4, memory: Memory, at: Place, vehicle: int, data: CourseData
+    reference: CourseReference,
+    x: Row,
+    short: Wrench4,
+    memory: Memory,
+    at: Place,
+    vehicle: int,
+    data: CourseData,
 ) -> Memory:
     """Return the memory with updated integrals, except those that the channels cannot follow.
 
@@ -325,8 +331,8 @@ def grown_integrals(
     """
     after = memory
     reach = at.reach
-    errors = wp.vec3(x[0], wp.clamp(-order.turn, -reach[2], reach[2]), x[9 - 2 * order.by_pitch])
-    bounds = wp.vec3(reach[0], reach[2], reach[3 - 2 * order.by_pitch])
+    errors = wp.vec3(x[0], wp.clamp(-reference.turn, -reach[2], reach[2]), x[9 - 2 * reference.by_pitch])
+    bounds = wp.vec3(reach[0], reach[2], reach[3 - 2 * reference.by_pitch])
     for i in range(3):
         axis = wp.where(i == 0, 0, wp.where(i == 1, 3, 2))
         push = -data.gains[vehicle, at.row, axis][10 + i] * errors[i]
@@ -338,12 +344,12 @@ def grown_integrals(
 
 @wp.func
 def steer(
-    order: CourseReference, q: wp.quat, nu: vec6, memory: Memory, vehicle: int, data: CourseData
+    reference: CourseReference, q: wp.quat, nu: vec6, memory: Memory, vehicle: int, data: CourseData
 ) -> CourseCommand:
     """Return the channels that execute a reference, and the memory for the next call.
 
     Args:
-        order: Reference.
+        reference: Reference of the autopilot.
         q: Attitude, body to world.
         nu: Velocity over ground, body frame [m/s, rad/s].
         memory: Memory after the previous command [m, rad s, N, N m, m/s]; `initial_memory` initially.
@@ -351,10 +357,10 @@ def steer(
         data: Numbers from `course_data`.
     """
     level = level_motion(q, nu, memory)
-    at = place_of(level.surge, order.by_pitch, vehicle, data)
+    at = place_of(level.surge, reference.by_pitch, vehicle, data)
     k, s = at.k, at.s
-    x = errors_of(order, q, nu, memory, heading_error(order, level, vehicle, data), at.reach)
-    wrench = demanded(order.speed, x, at, vehicle, data)
+    x = errors_of(reference, q, nu, memory, heading_error(reference, level, vehicle, data), at.reach)
+    wrench = demanded(reference.speed, x, at, vehicle, data)
 
     tau = vec6(wrench[0], 0.0, 0.0, wrench[1], wrench[2], wrench[3])
     travel, speeds = data.travel[vehicle], vehicle * data.trim.shape[1]
@@ -365,9 +371,9 @@ def steer(
         achieved += (1.0 - s) * low[i] * data.columns[vehicle, k, i]
         achieved += s * high[i] * data.columns[vehicle, k + 1, i]
 
-    answer = CourseCommand()
-    answer.channels = between(data.trim[vehicle, k] + low, data.trim[vehicle, k + 1] + high, s)
-    after = grown_integrals(order, x, wrench - achieved, memory, at, vehicle, data)
+    command = CourseCommand()
+    command.channels = between(data.trim[vehicle, k] + low, data.trim[vehicle, k + 1] + high, s)
+    after = grown_integrals(reference, x, wrench - achieved, memory, at, vehicle, data)
     for i in range(4):
         after[3 + i] = between(memory[3 + i], achieved[i], data.share[vehicle][i])
     rest = between(data.rest[vehicle, k], data.rest[vehicle, k + 1], s)
@@ -380,12 +386,12 @@ def steer(
     current = level.current + follow * more * level.left
     after[9] = current[0]
     after[10] = current[1]
-    answer.memory = after
-    return answer
+    command.memory = after
+    return command
 
 
 @wp.func
-def order_of(
+def reference_of(
     speed: float, turn: float, dive: float, by_pitch: int, vehicle: int, data: CourseData
 ) -> CourseReference:
     """Return the reference for an action of mode `course` or `course_pitch`.
@@ -398,21 +404,21 @@ def order_of(
         vehicle: First index into `data`.
         data: Numbers from `course_data`.
     """
-    order = CourseReference()
+    reference = CourseReference()
     whole = data.spacing[vehicle] * float(data.trim.shape[1] - 1)
-    order.speed = data.first[vehicle] + 0.5 * (1.0 + wp.clamp(speed, -1.0, 1.0)) * whole
-    order.turn = wp.static(WIDEST) * wp.clamp(turn, -1.0, 1.0)
-    order.by_pitch = by_pitch
+    reference.speed = data.first[vehicle] + 0.5 * (1.0 + wp.clamp(speed, -1.0, 1.0)) * whole
+    reference.turn = wp.static(WIDEST) * wp.clamp(turn, -1.0, 1.0)
+    reference.by_pitch = by_pitch
     if by_pitch != 0:
-        order.pitch = wp.static(STEEPEST) * wp.clamp(dive, -1.0, 1.0)
+        reference.pitch = wp.static(STEEPEST) * wp.clamp(dive, -1.0, 1.0)
     else:
-        order.rise = -wp.static(FARTHEST) * wp.clamp(dive, -1.0, 1.0)
-    return order
+        reference.rise = -wp.static(FARTHEST) * wp.clamp(dive, -1.0, 1.0)
+    return reference
 
 
 @wp.kernel(enable_backward=False)
 def steer_rows(
-    orders: wp.array(dtype=CourseReference),
+    references: wp.array(dtype=CourseReference),
     q: wp.array(dtype=wp.quat),
     nu: wp.array(dtype=vec6),
     memory: wp.array(dtype=Memory),
@@ -423,7 +429,7 @@ def steer_rows(
     """Run `steer` for the first vehicle, row by row.
 
     Args:
-        orders: References, (N,).
+        references: References, (N,).
         q: Attitudes, body to world, (N,).
         nu: Velocities over ground, body frame [m/s, rad/s], (N,).
         memory: Memory after the previous command [m, rad s, N, N m, m/s], (N,).
@@ -432,9 +438,9 @@ def steer_rows(
         after: Resulting memory for the next command [m, rad s, N, N m, m/s], (N,).
     """
     i = wp.tid()
-    answer = steer(orders[i], q[i], nu[i], memory[i], 0, data)
-    channels[i] = answer.channels
-    after[i] = answer.memory
+    command = steer(references[i], q[i], nu[i], memory[i], 0, data)
+    channels[i] = command.channels
+    after[i] = command.memory
 
 
 def top_speed(vehicle: Vehicle, hydrodynamics: str) -> float:
@@ -678,14 +684,14 @@ class CoursePilot:
             *bow[:, :2].T
         )
         way = np.where(known[:, None], ground, bow)
-        orders = self._orders(len(q))
-        orders["speed"], orders["pitch"] = speed, pitch
-        orders["turn"] = np.asarray(course) - np.arctan2(way[:, 1], way[:, 0])
+        references = self._references(len(q))
+        references["speed"], references["pitch"] = speed, pitch
+        references["turn"] = np.asarray(course) - np.arctan2(way[:, 1], way[:, 0])
         if depth is None:
-            orders["by_pitch"] = 1
+            references["by_pitch"] = 1
         else:
-            orders["rise"] = -np.asarray(depth, float) - np.atleast_2d(measured.position)[:, 2]
-        return self._carry_out(orders, measured, memory)
+            references["rise"] = -np.asarray(depth, float) - np.atleast_2d(measured.position)[:, 2]
+        return self._carry_out(references, measured, memory)
 
     def act(
         self, memory: Array, measured: Measured, action: npt.ArrayLike, *, by_pitch: bool
@@ -695,27 +701,27 @@ class CoursePilot:
         Args:
             memory: Memory from `reset` or after the previous command [m, rad s, N, N m, m/s], (n, 11).
             measured: The vehicles' states, with n rows.
-            action: Speed, change of course, and dive, as for `order_of` [-], (n, 3).
+            action: Speed, change of course, and dive, as for `reference_of` [-], (n, 3).
             by_pitch: True if the third component is pitch, False if it is depth.
         """
         speed, turn, dive = np.clip(np.atleast_2d(np.asarray(action, float)), -1.0, 1.0).T
-        orders = self._orders(len(speed))
+        references = self._references(len(speed))
         low, high = self.model.speeds[0], self.model.speeds[-1]
-        orders["speed"], orders["turn"] = low + 0.5 * (1.0 + speed) * (high - low), WIDEST * turn
-        orders["by_pitch"] = int(by_pitch)
-        orders["pitch" if by_pitch else "rise"] = STEEPEST * dive if by_pitch else -FARTHEST * dive
-        return self._carry_out(orders, measured, memory)
+        references["speed"], references["turn"] = low + 0.5 * (1.0 + speed) * (high - low), WIDEST * turn
+        references["by_pitch"] = int(by_pitch)
+        references["pitch" if by_pitch else "rise"] = STEEPEST * dive if by_pitch else -FARTHEST * dive
+        return self._carry_out(references, measured, memory)
 
-    def _orders(self, n: int) -> Any:
+    def _references(self, n: int) -> Any:
         struct: Any = CourseReference
         return np.zeros(n, dtype=struct.numpy_dtype())
 
-    def _carry_out(self, orders: Any, measured: Measured, memory: Array) -> tuple[Array, Array]:
+    def _carry_out(self, references: Any, measured: Measured, memory: Array) -> tuple[Array, Array]:
         q, nu = (np.atleast_2d(np.asarray(x, float)) for x in (measured.quaternion, measured.nu))
         n = len(q)
         rows = ((q, wp.quat), (nu, vec6), (memory, Memory))
         given: list[Any] = [wp.array(x.astype(np.float32), dtype=kind, device="cpu") for x, kind in rows]
-        given.insert(0, wp.array(orders, dtype=CourseReference, device="cpu"))
+        given.insert(0, wp.array(references, dtype=CourseReference, device="cpu"))
         out = [wp.zeros(n, dtype=kind, device="cpu") for kind in (vec8, Memory)]
         wp.launch(steer_rows, n, [*given, self.data, *out], device="cpu")
         channels, after = (array.numpy().astype(float) for array in out)

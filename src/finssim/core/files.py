@@ -188,9 +188,8 @@ def _remove_stale(lock: Path, label: str | os.PathLike[str]) -> None:
         except PermissionError:
             pass  # Windows: it is open
         else:
-            if (
-                aside.read_text(encoding="utf-8") != text
-            ):  # another process created a new lock in the meantime
+            if aside.read_text(encoding="utf-8") != text:
+                # Another process created a new lock in the meantime.
                 os.rename(aside, lock)
             else:
                 aside.unlink()

@@ -220,9 +220,8 @@ def _record(data: bytes | mmap.mmap, at: int) -> tuple[Any, int] | None:
     end: int = at + 9 + length
     if not 0x01 <= kind <= DATA_END or end > len(data):
         return None
-    if (
-        kind == MESSAGE
-    ):  # the most frequent kind: parsed without the library's stream, which takes three times as long
+    if kind == MESSAGE:
+        # The most frequent kind: parsed without the library's stream, which takes three times as long.
         if length < 22:
             return None
         channel, sequence, log_time, publish_time = struct.unpack("<HIQQ", data[at + 9 : at + 31])

@@ -78,9 +78,8 @@ def lost_interrupts_repeated() -> Iterator[None]:
         if not issubclass(lost.exc_type, KeyboardInterrupt):
             report(lost)
         elif pending is None:
-            pending = threading.Timer(
-                AGAIN, again
-            )  # delayed: a signal sent from here would be discarded again
+            # Delayed: a signal sent from here would be discarded again.
+            pending = threading.Timer(AGAIN, again)
             pending.daemon = True
             pending.start()
 

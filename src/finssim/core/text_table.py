@@ -90,9 +90,8 @@ def decoded(raw: bytes) -> tuple[str, bool]:
     intact = raw.split(b"\0", 1)[0]
     try:
         text = intact.decode("utf-8-sig")
-    except (
-        UnicodeDecodeError
-    ):  # spreadsheets write µ and ± as one byte; control bytes indicate that it is not text
+    except UnicodeDecodeError:
+        # Spreadsheets write µ and ± as one byte; control bytes indicate that it is not text.
         codec = "utf-8-sig" if re.search(rb"[\x01-\x08\x0e-\x1f\x7f]", intact) else "cp1252"
         text = intact.decode(codec, errors="replace")
     return text, len(intact) < len(raw)

@@ -249,9 +249,8 @@ def resample(t: ArrayLike, position: ArrayLike, yaw: ArrayLike) -> tuple[Array, 
     before, after = after - 1, np.minimum(after, len(t) - 1)
     nearest = np.where(np.abs(t[before] - grid) <= np.abs(t[after] - grid), t[before], t[after])
     inside = (t[before] <= grid) & (grid <= t[after]) & (t[after] - t[before] <= MAX_GAP)
-    inside |= (
-        np.abs(nearest - grid) <= 1e-3
-    )  # a sample at the grid point itself, with a time rounded by the log
+    # A sample at the grid point itself, with a time rounded by the log.
+    inside |= np.abs(nearest - grid) <= 1e-3
     columns = [np.where(inside, np.interp(grid, t, column), np.nan) for column in (*position.T, yaw)]
     return grid, np.stack(columns[:3], axis=-1), columns[3]
 

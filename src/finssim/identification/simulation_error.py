@@ -299,8 +299,8 @@ def fit_by_simulation(
     remarks = [*remarks, *more]
     say("preparing the start", 0.1)
     estimate = [*estimate, "thrust_scale"] if likely else estimate
-    telling_trials = exciting_trials(prepared, vehicle, chosen)
-    fit = Stages(telling_trials, vehicle, chosen, estimate, known or {}, horizon, say, likely, published)
+    exciting = exciting_trials(prepared, vehicle, chosen)
+    fit = Stages(exciting, vehicle, chosen, estimate, known or {}, horizon, say, likely, published)
     fit.require_shown()
     if isinstance(damping, str):
         kinds = dict.fromkeys(chosen, "both" if damping == "auto" else damping)

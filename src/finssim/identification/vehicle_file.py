@@ -506,9 +506,8 @@ def number_in(vehicle: Vehicle, path: str) -> float | None:
     for leaf, full_path, value in numbers(vehicle):
         if _same_number(keys, leaf, vehicle) or keys == full_path:
             return value
-    return dict(leaves(vehicle.values())).get(
-        keys
-    )  # a coupling of a matrix that is given by its diagonal in the file
+    # A coupling of a matrix that is given by its diagonal in the file.
+    return dict(leaves(vehicle.values())).get(keys)
 
 
 def estimate_at(path: str, fit: Fit, vehicle: Vehicle) -> Estimate | None:

@@ -79,15 +79,15 @@ class Env(gymnasium.Env[Any, Any]):
         self.observation_space = observation_space(self.environment)
         self.action_space = action_space(self.environment)
         self.metadata = {**self.metadata, "render_fps": round(1.0 / self.environment.task.control_step)}
-        self._onlooker: Any = None
+        self._chase_camera: Any = None
 
     def render(self) -> NDArray[np.uint8] | None:
         """Return a rendered view from behind the vehicle, uint8 (360, 640, 3), with `render_mode="rgb_array"`;
         otherwise None."""
         if self.render_mode != "rgb_array":
             return None
-        self._onlooker = self._onlooker or described_world("pool").onlooker(self.environment)
-        return self._onlooker.picture()
+        self._chase_camera = self._chase_camera or described_world("pool").chase_camera(self.environment)
+        return self._chase_camera.picture()
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

@@ -625,9 +625,8 @@ class Plant:
         s = self.simulator
         pipeline = s.pipeline()
         propellers = propeller_bank(vehicle, spec)
-        plant_model = self._plant_model = (
-            PlantModel()
-        )  # kept: a captured launch does not keep arrays inside structs alive
+        # Kept: a captured launch does not keep arrays inside structs alive.
+        plant_model = self._plant_model = PlantModel()
         plant_model.motors, plant_model.propellers, plant_model.hidden = (
             self.motors,
             propellers,

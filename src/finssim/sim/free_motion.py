@@ -159,9 +159,8 @@ def stability(vehicle: Vehicle, hydrodynamics: str = "calibrated") -> tuple[floa
     top = top_speed(vehicle, hydrodynamics)
     speeds = np.linspace(0.0, top, 101)
     values, vectors = np.linalg.eig(_system_matrices(vehicle, speeds, hydrodynamics))
-    part = np.abs(
-        vectors * np.swapaxes(np.linalg.pinv(vectors), 1, 2)
-    )  # participation factors of states in modes [-]
+    # Participation factors of states in modes [-].
+    part = np.abs(vectors * np.swapaxes(np.linalg.pinv(vectors), 1, 2))
     share = np.stack([part[:, states].sum(axis=1) for states in MOTIONS.values()])
     motions = {}
     for k, name in enumerate(MOTIONS):

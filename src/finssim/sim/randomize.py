@@ -207,7 +207,7 @@ class Nominal:
     waves: int  # number of nominal waves, which stay in the first slots
     sea_ratio: wp.array(
         dtype=float
-    )  # frequencies of a drawn sea's waves relative to the peak [-]; empty without a sea
+    )  # frequencies of a drawn sea's waves over the peak's [-]; empty without one
     sea_turn: wp.array(dtype=float)  # directions of these waves relative to the sea's [rad]
     extra: wp.array3d(dtype=float)  # parameters of the vehicles' terms in their units, one world
     factor: wp.array(dtype=int)  # entry that multiplies each parameter, -1 for none

@@ -303,9 +303,8 @@ def transfer_experiment(
 
     ready, beside = [name for name, row in chosen.items() if row.training is None], {}
     controllers = {(name, s): chosen[name].controller for name in ready for s in run_seeds}
-    if (
-        robot is None and settings.address is None and settings.seeds == 1
-    ):  # with few trainings, the remaining processors run other rows
+    if robot is None and settings.address is None and settings.seeds == 1:
+        # With few trainings, the remaining processors run other rows.
         learned = [name for name in chosen if name not in ready]
         beside["more"] = lambda: jobs_of(learned, train_missing())
     else:

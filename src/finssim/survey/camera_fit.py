@@ -160,9 +160,8 @@ def _fisheye(views: Sequence[BoardView], size: tuple[int, int], model: str) -> t
     import cv2
 
     points, pixels = ([np.asarray(getattr(v, n), float)[None] for v in views] for n in ("points", "pixels"))
-    names = (
-        cv2 if hasattr(cv2, "CALIB_RECOMPUTE_EXTRINSIC") else cv2.fisheye
-    )  # location of the flags in OpenCV 4
+    # Location of the flags in OpenCV 4.
+    names = cv2 if hasattr(cv2, "CALIB_RECOMPUTE_EXTRINSIC") else cv2.fisheye
     flags = names.CALIB_RECOMPUTE_EXTRINSIC | names.CALIB_FIX_SKEW | names.CALIB_USE_INTRINSIC_GUESS
     stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-12)
     ends, refusal = [], None

@@ -78,18 +78,14 @@ class TorchResults:
     reward: wp.array2d(dtype=float)  # reward, (worlds, agents)
     terminated: wp.array(dtype=int)
     inside: wp.array(dtype=int)  # 1: within the tolerance of success
-    counted: wp.array2d(
-        dtype=float
-    )  # (worlds, task.totals): increments of this step, in the units of the totals
+    counted: wp.array2d(dtype=float)  # (worlds, task.totals): increments of this step, in their units
     position: wp.array2d(dtype=wp.vec3)  # (worlds, vehicles), at the start of an episode; world frame [m]
     quaternion: wp.array2d(dtype=wp.quat)
     velocity: wp.array2d(dtype=vec6)
     goal_position: wp.array(dtype=wp.vec3)
     goal_quaternion: wp.array(dtype=wp.quat)
     begun: wp.array2d(dtype=float)  # (worlds, numbers): memory at the start, in the units of the task
-    memory: wp.array2d(
-        dtype=float
-    )  # (worlds, numbers): variables of the task within an episode, in its units
+    memory: wp.array2d(dtype=float)  # (worlds, numbers): memory during the episode, in the units of the task
 
 
 @wp.struct
@@ -122,7 +118,7 @@ class TaskArrays:
     final_totals: wp.array2d(dtype=float)  # the same of the latest finished episode, in their units
     earned: wp.array2d(
         dtype=float
-    )  # (worlds, rewards and ends): contribution of each to the return, mean over agents
+    )  # (worlds, rewards and ends): contributions to the return, mean over agents
     final_earned: wp.array2d(dtype=float)  # the same rewards of the latest finished episode
     goal_position: wp.array(dtype=wp.vec3)  # world frame [m]
     goal_quaternion: wp.array(dtype=wp.quat)  # body to world
@@ -130,8 +126,7 @@ class TaskArrays:
     current: wp.array(dtype=wp.vec3)  # current at the surface, world frame [m/s]: the simulator's array
     seabed: wp.array2d(
         dtype=wp.vec4
-    )  # (worlds, ripples), for tasks over a seabed: height [m], wave number [rad/m],
-    # direction [rad] and phase [rad] of each
+    )  # (worlds, ripples): height [m], wave number [rad/m], direction, phase [rad]
     path: PathTable  # only for tasks along a path in space
     target: TargetMotion  # only for tasks with a moving goal
     funnel: Funnel  # only for tasks with a dock: the simulator's struct; its pose is the goal's
@@ -139,15 +134,11 @@ class TaskArrays:
     messages: MessageTable  # only for tasks with communication between agents
     net: NetTable  # only for tasks with a net
     torch_results: TorchResults  # only for tasks in plain torch
-    position: wp.array2d(
-        dtype=wp.vec3
-    )  # (worlds, vehicles), as measured, possibly with noise; world frame [m]
+    position: wp.array2d(dtype=wp.vec3)  # (worlds, vehicles), as measured; world frame [m]
     quaternion: wp.array2d(dtype=wp.quat)
     velocity: wp.array2d(dtype=vec6)
     ranges: wp.array2d(dtype=float)  # (worlds, task.ranges), as measured [m]; infinite without an echo
-    privileged: wp.array2d(
-        dtype=float
-    )  # (worlds, agents * P): drawn parameters, scaled deviation from nominal [-]
+    privileged: wp.array2d(dtype=float)  # (worlds, agents * P): drawn parameters, scaled deviations [-]
     final_privileged: wp.array2d(dtype=float)  # the same of the latest finished episode [-]
 
 

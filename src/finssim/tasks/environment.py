@@ -12,7 +12,7 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from finssim.control import ControlError
-from finssim.control.course import CourseData, Memory, course_data, order_of, steer
+from finssim.control.course import CourseData, Memory, course_data, reference_of, steer
 from finssim.control.modes import MODES, ModeData, mode_data, thrusts_of, thrusts_of_shares
 from finssim.physics.plant import VehicleCommand
 from finssim.physics.types import vec8
@@ -112,13 +112,13 @@ def act_by_course(
     """Write the channels of every vehicle by its autopilot, which uses the same measurements as the agent."""
     i, v = wp.tid()
     w = world_offset + i
-    order = order_of(
+    reference = reference_of(
         arrays.action[w, 3 * v], arrays.action[w, 3 * v + 1], arrays.action[w, 3 * v + 2], by_pitch, v, data
     )
     q = arrays.quaternion[w, v]
-    answer = steer(order, q, arrays.velocity[w, v], arrays.steering[w, v], v, data)
-    command[w, v].thrust = answer.channels
-    arrays.steering[w, v] = answer.memory
+    steered = steer(reference, q, arrays.velocity[w, v], arrays.steering[w, v], v, data)
+    command[w, v].thrust = steered.channels
+    arrays.steering[w, v] = steered.memory
 
 
 class Environment:

@@ -546,9 +546,8 @@ def _compiled(task: Task, text: str, functions: Mapping[str, Any]) -> Kernels:
     kind = task.settings_class()
     digest = hashlib.sha256(text.encode()).hexdigest()[:8]
     name = f"{kind.__module__}.{kind.__qualname__}_{digest}"
-    if any(
-        kernels.evaluate.module.name == name for kernels in _made.values()
-    ):  # other functions with the same names
+    if any(kernels.evaluate.module.name == name for kernels in _made.values()):
+        # Other functions with the same names.
         name = f"{name}_{next(_numbers)}"
     path = f"<kernels of {name}>"
     linecache.cache[path] = (len(text), None, text.splitlines(keepends=True), path)  # Warp reads the source

@@ -68,9 +68,8 @@ def attitude_samples(trial: Trial) -> tuple[Array, Array, tuple[str, ...]]:
         return trial.t[good], q[good], EULER
     given = tuple(name for name in EULER if trial.has(name))
     if "roll" in given and "pitch" not in given or "pitch" in given and "roll" not in given:
-        given = tuple(
-            name for name in given if name == "yaw"
-        )  # roll or pitch alone does not determine the tilt
+        # Roll or pitch alone does not determine the tilt.
+        given = tuple(name for name in given if name == "yaw")
     if not given:
         return np.empty(0), np.empty((0, 4)), ()
     t = max((trial.series(name)[0] for name in given), key=len)
@@ -489,9 +488,8 @@ def offset(fixed: Array, moved: Array) -> Offset | None:
     if not height >= LEAST:
         return None
     parts = [_peak(_correlation(np.delete(sums, b, axis=1).sum(axis=1)), near)[0] for b in range(PARTS)]
-    spread = float(
-        np.sqrt((PARTS - 1) * np.var(parts))
-    )  # jackknife: a single short event must not appear certain
+    # Jackknife: a single short event must not appear certain.
+    spread = float(np.sqrt((PARTS - 1) * np.var(parts)))
     if not np.isfinite(spread):  # without one of the parts there is no peak
         return None
     return Offset(-float(lags[0] + place) / RATE, max(spread, 0.1) / RATE, height)

@@ -235,9 +235,8 @@ def _merged(base: Any, change: Any, path: tuple[str, ...], origins: Origins) -> 
             if value is None:
                 result.pop(key, None)
                 _forget(inner, origins)
-                if inner == (
-                    "tags",
-                ):  # a vehicle may have no tags; every other omitted section has its default
+                if inner == ("tags",):
+                    # A vehicle may have no tags; every other omitted section has its default.
                     result[key] = None
             else:
                 result[key] = _merged(base.get(key), value, inner, origins)
@@ -399,9 +398,8 @@ def read_file(path: Path, label: str) -> tuple[dict[str, Any], dict[str, Provena
         raise VehicleError(
             f"{label}: extends is {tree['extends']!r}, expected the name or path of a vehicle, such as finsrov"
         )
-    records = tree.pop(
-        "calibrations", None
-    )  # records of fits, not parameters of the vehicle: they need no origin
+    # Records of fits, not parameters of the vehicle: they need no origin.
+    records = tree.pop("calibrations", None)
     provenance: dict[str, Provenance] = {}
     values = _plain(tree, (), None, provenance, label)
     if records is not None:

@@ -101,9 +101,8 @@ def test_a_barrel_refuses_what_lies_beyond_its_fold():
     lens = Lens(**SIZE, distortion=(-0.4, 0.0, 0.0, 0.0))
     fold = np.sqrt(1.0 / 1.2)
     assert lens.field_of_view == pytest.approx(np.arctan(fold), rel=1e-8)
-    r = fold * np.array(
-        [0.5, 0.99, 0.999999, 1.000001, 1.2, 1.58, 2.0]
-    )  # the last but one reappears near the axis
+    # The last but one reappears near the axis.
+    r = fold * np.array([0.5, 0.99, 0.999999, 1.000001, 1.2, 1.58, 2.0])
     points = np.stack([r, 0 * r, 1 + 0 * r], axis=-1)
     pixels, ok = lens.project(points)
     assert ok.tolist() == [True] * 3 + [False] * 4

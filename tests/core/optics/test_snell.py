@@ -52,9 +52,8 @@ def test_no_path_is_shorter(index):
             )
             brute, least = best.x, best.fun
         assert path(ours[:-1]) <= least + 1e-14
-        np.testing.assert_allclose(
-            ours[:-1], brute, atol=3e-7
-        )  # a minimum is flat: the root of the rounding error of the path
+        # A minimum is flat: the root of the rounding error of the path.
+        np.testing.assert_allclose(ours[:-1], brute, atol=3e-7)
         shifted = [path(ours[:-1] + d) - path(ours[:-1]) for d in (1e-4, -1e-4)]
         assert min(shifted) > 0.0
 

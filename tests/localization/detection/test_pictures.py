@@ -157,9 +157,8 @@ def test_notes_on_turning_the_picture_are_not_followed(tmp_path):
     """A phone held upright writes the same pixel frame as one held flat."""
     write_picture(scene(60), tmp_path / "a.jpg")
     raw = (tmp_path / "a.jpg").read_bytes()
-    entry = (
-        b"\x01\x12" + b"\x00\x03" + b"\x00\x00\x00\x01" + b"\x00\x06\x00\x00"
-    )  # orientation 6: rotate by 90°
+    # Orientation 6: rotate by 90°.
+    entry = b"\x01\x12" + b"\x00\x03" + b"\x00\x00\x00\x01" + b"\x00\x06\x00\x00"
     exif = b"Exif\0\0MM\x00\x2a\x00\x00\x00\x08\x00\x01" + entry + b"\x00\x00\x00\x00"
     (tmp_path / "a.jpg").write_bytes(
         raw[:2] + b"\xff\xe1" + (2 + len(exif)).to_bytes(2, "big") + exif + raw[2:]

@@ -234,9 +234,8 @@ def test_the_state_never_runs_away(mode, all_silent):
         assert np.linalg.eigvalsh(x.P)[0] > -1e-6
     extra_variance = [x.P[0, 0] for x in found]
     assert all(b >= a * (1 - 1e-9) for a, b in zip(extra_variance, extra_variance[1:], strict=False))
-    assert (
-        extra_variance[-1] <= Settings().largest_variance * 1.001
-    )  # speed of the IMU, with a lever arm of 5 cm
+    # Speed of the IMU, with a lever arm of 5 cm.
+    assert extra_variance[-1] <= Settings().largest_variance * 1.001
     assert extra_variance[1] > 0.1
 
 

@@ -61,9 +61,8 @@ def test_the_covariance_is_that_of_the_errors(case):
         400,
         np.random.default_rng(1),
     )
-    assert (
-        3.0 - 0.42 < value < 3.0 + 0.55
-    )  # chi² with 1200 degrees of freedom divided by 400; Huber's rho adds 3 %
+    # Chi² with 1200 degrees of freedom divided by 400; Huber's rho adds 3 %.
+    assert 3.0 - 0.42 < value < 3.0 + 0.55
 
 
 @pytest.mark.slow

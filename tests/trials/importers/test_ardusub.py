@@ -142,9 +142,8 @@ def test_outputs_push_as_the_autopilot_means_them(frame, name):
     B = dict(zip(vehicle.thrusters, vehicle.control_matrix.T, strict=True))
     for motor, (roll, pitch, yaw, up, forward, right) in enumerate(FRAMES[frame][1]):
         thruster, sign = outputs[motor + 1]
-        wrench = FROM_FOSSEN.twist(
-            sign * directions[motor] * B[thruster]
-        )  # FinsSim's and Fossen's axes differ by half a turn
+        # FinsSim's and Fossen's axes differ by half a turn.
+        wrench = FROM_FOSSEN.twist(sign * directions[motor] * B[thruster])
         meant = np.array([forward, right, -up, roll, pitch, yaw])
         used = meant != 0.0
         np.testing.assert_array_equal(np.sign(wrench[used]), np.sign(meant[used]))

@@ -38,10 +38,10 @@ from finssim.vehicles.part import (
 from finssim.vehicles.part_file import GREATEST, checked_part, locate, names_in, read_tree
 
 if TYPE_CHECKING:
+    from finssim.extensions.perception.chase_camera import ChaseCamera
     from finssim.extensions.perception.layout import WorldLayout
     from finssim.extensions.perception.model import WorldBatch
     from finssim.extensions.perception.onboard import OnboardPlan
-    from finssim.extensions.perception.onlooker import ChaseCamera
     from finssim.extensions.perception.parts import ModelPart
     from finssim.extensions.perception.sight import Sight
     from finssim.sim.overhead_camera import WaterOptics
@@ -589,10 +589,10 @@ class World(Part):
 
         return OnboardPlan(vehicle=vehicle, world=self, seed=seed, solid=solid)
 
-    def onlooker(self, environment: Environment, world: int = 0, width: int = 640) -> ChaseCamera:
+    def chase_camera(self, environment: Environment, world: int = 0, width: int = 640) -> ChaseCamera:
         """Return a camera that follows a vehicle of an environment; for tasks without a world, the world is
         drawn around them."""
-        from finssim.extensions.perception.onlooker import ChaseCamera
+        from finssim.extensions.perception.chase_camera import ChaseCamera
 
         return ChaseCamera(environment, self, world, width)
 

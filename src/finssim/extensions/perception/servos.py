@@ -452,9 +452,8 @@ class WallFollower(DriveBaseline):
         for _ in range(2):
             cell = levels.argmax(2)
             r = (cell + 0.5) * self.sonar.bin_length - self.behind
-            weight = r * (
-                levels.max(2) >= self.least
-            )  # the spacing of beams along a side grows with the range
+            # The spacing of beams along a side grows with the range.
+            weight = r * (levels.max(2) >= self.least)
             rows.append((r * np.cos(azimuth) + self.sonar.position[0], r * np.sin(azimuth), weight))
             levels = np.where(np.abs(np.arange(cells) - cell[..., None]) <= 3, 0.0, levels)
         x, y, weight = (np.concatenate(parts, 1) for parts in zip(*rows, strict=True))

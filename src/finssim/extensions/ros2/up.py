@@ -607,9 +607,8 @@ def up(graph: str, *, options: Annotated[Options, "options"], notify: Callable[[
         for name, topic in topics_of(plan):
             notify(f"  {name}  {topic.type}  {topic.meaning}")
         with interruptible() as interrupted:
-            rclpy.init(
-                args=[], signal_handler_options=SignalHandlerOptions.NO
-            )  # `interruptible` handles signals
+            # `interruptible` handles signals.
+            rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
             try:
                 watchers = [Watcher(plan, namespace, arm=options.arm) for namespace in plan.namespaces]
                 with Supervisor(plan, parameters, notify) as nodes:

@@ -647,9 +647,8 @@ class Participant:
             if kind not in self._builtin:
                 self._builtin[kind] = BuiltinDataReader(self.entity, topics[kind]), {}
             reader, known = self._builtin[kind]
-            for sample in reader.take(
-                N=10_000
-            ):  # only changes: those that have left would be read again and again
+            for sample in reader.take(N=10_000):
+                # Only changes: those that have left would be read again and again.
                 if sample.sample_info.instance_state == InstanceState.Alive:
                     record = EndpointRecord(sample.topic_name, sample.type_name, sample.key.bytes, sample.qos)
                     known[sample.key.bytes] = record

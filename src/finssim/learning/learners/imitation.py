@@ -150,9 +150,8 @@ class _Cloner(ActingLearner):
         with torch.no_grad():
             for _ in range(steps):
                 observation = self._worlds.observation.to(self.device, copy=True)
-                observation = (
-                    observation[:, 0] if self._pictures else observation
-                )  # tasks with pictures have one agent
+                # Tasks with pictures have one agent.
+                observation = observation[:, 0] if self._pictures else observation
                 self._worlds.step(self.policy(observation, **self._pictures).clamp(-1.0, 1.0))
                 self.tally.look()
 

@@ -243,7 +243,8 @@ def _cut_short(raw: bytes) -> bool:
     while raw[at : at + 2] not in (
         b"\xff\xda",
         b"",
-    ):  # skip the segments, which may contain a thumbnail
+    ):
+        # Skip the segments, which may contain a thumbnail.
         if raw[at] != 0xFF or at + 4 > len(raw):
             return True
         filled = raw[at + 1] == 0xFF  # a fill byte

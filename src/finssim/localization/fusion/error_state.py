@@ -298,9 +298,8 @@ class ErrorState(Filter[InertialTrack]):
         """Return the track at the time of an IMU sample."""
         if sample.force is None:
             return track, (Outcome("imu", "no acceleration"),)
-        if (
-            track.heard(sample.time) and track.force is not None
-        ):  # the mean over the step, rather than its first sample
+        if track.heard(sample.time) and track.force is not None:
+            # The mean over the step, rather than its first sample.
             omega, force = _mean(track.omega, sample.omega), _mean(track.force, sample.force)
             track = changed(track, omega=omega, force=force)
         track = self.advanced(track, sample.time)

@@ -153,9 +153,8 @@ class _Names:
         dotted = any(symbol and "dot" in name for name, symbol in symbols.items())
         for name, symbol in symbols.items():
             value = self.first(name) if symbol else None
-            if (
-                symbol and value is not None and not (dotted and re.match(r"._?d", name))
-            ):  # in that case Ndr is a rudder coefficient
+            if symbol and value is not None and not (dotted and re.match(r"._?d", name)):
+                # In that case Ndr is a rudder coefficient.
                 out.setdefault(symbol[0], np.zeros((6, 6)))[symbol[1:]] = value
         return out
 

@@ -306,9 +306,8 @@ def enclosing_ellipsoid(points: Array) -> Array:
     steps = 0
     while True:
         mean = weights @ points
-        spread = np.maximum(
-            weights @ points**2 - mean**2, 1e-18
-        )  # flat parts have no extent along the third axis
+        # Flat parts have no extent along the third axis.
+        spread = np.maximum(weights @ points**2 - mean**2, 1e-18)
         reach = ((points - mean) ** 2 / (3.0 * spread)).sum(axis=1)
         farthest = int(np.argmax(reach))
         excess = float(reach[farthest]) - 1.0

@@ -313,9 +313,8 @@ def test_who_followed_takes_over_without_a_jump(pair):
 def test_of_two_that_started_together_one_gives_way(pair, monkeypatch):
     """Both published before they discovered each other: the first by name continues, and soon there is one
     clock."""
-    monkeypatch.setattr(
-        "finssim.extensions.ros2.worlds.clock.CLAIMING", math.inf
-    )  # for any duration of the test
+    # For any duration of the test.
+    monkeypatch.setattr("finssim.extensions.ros2.worlds.clock.CLAIMING", math.inf)
     first, second = pair
     now = 1e-9 * second.clock._steady.now().nanoseconds
     second.clock._claim(now)

@@ -208,9 +208,8 @@ class HardwareBridge(RobotNode):
             self.bridge.note(now, note)
         self.intake.link.notes.clear()
         command = self.bridge.tick(now)
-        if (
-            self.now() - now < self.bridge.settings.command_timeout
-        ):  # otherwise the process was suspended in between
+        if self.now() - now < self.bridge.settings.command_timeout:
+            # Otherwise the process was suspended in between.
             for data in self.intake.link.encode(now, command, self.bridge.state):
                 self.transport.send(data)
         self.topics.publish(now, normalised=command.normalised, shaft_speed=self.shafts)

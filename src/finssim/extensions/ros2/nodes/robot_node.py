@@ -239,9 +239,8 @@ class RobotNode(Node):
             steady = Clock(clock_type=ClockType.STEADY_TIME)
             self._quiet = self.create_timer(QUIET, self._tell_done, clock=steady)
             self._quiet.cancel()
-            self.create_timer(
-                STEP, self._quiet.reset
-            )  # created last: others that are due at the same time run first
+            # Created last: others that are due at the same time run first.
+            self.create_timer(STEP, self._quiet.reset)
             self.create_timer(AGAIN, lambda: self.send("done", self._done), clock=steady)
 
     def _tell_done(self) -> None:

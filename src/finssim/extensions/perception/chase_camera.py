@@ -81,7 +81,7 @@ class ChaseCamera:
                 f"pictures need {error.name}: pip install 'finssim[perception]'"
             ) from error
         device = CameraDevice(
-            about="an onlooker", source="-", width=width, height=9 * width // 16, focal_length=0.62 * width,
+            about="a chase camera", source="-", width=width, height=9 * width // 16, focal_length=0.62 * width,
             white_balance=0.6, rate=10.0,
         )  # fmt: skip
         self._camera = CameraBatch(self._batch, device)
