@@ -175,3 +175,16 @@ def test_a_compass_starts_the_heading_and_its_offset_stays_in_doubt():
     found = estimator.estimate(1.0)
     assert found.yaw == pytest.approx(math.pi / 2.0) and found.yaw_variance >= 0.05**2 - 1e-12
     np.testing.assert_allclose(found.x[3:5], [0.0, 0.3], atol=0.02)
+
+
+def test_a_compass_sample_counts_with_its_offset_and_its_noise():
+    """The second heading is weighted by the variances of noise and offset, as in a Kalman filter of one state."""
+    aids = Aids(heading_bias=0.05, heading_std=0.01)
+    estimator = Estimator(Settings(aids=aids), SITE)
+    estimator.add(VisionSample(0.0, (1.0, 2.0), None))
+    estimator.add(ImuSample(0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 9.81), (0.0, 0.0)))
+    estimator.add(HeadingSample(0.0, 0.3))
+    before = estimator.estimate()
+    estimator.add(HeadingSample(1e-6, 0.4))
+    gain = before.yaw_variance / (before.yaw_variance + 0.05**2 + 0.01**2)
+    assert estimator.estimate().yaw - before.yaw == pytest.approx(0.1 * gain, rel=1e-6)
