@@ -1,5 +1,6 @@
 """Tables with a map become trials: units, frames, time, several files, splitting and refusals."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -286,6 +287,46 @@ def test_one_sentence_says_what_is_wrong(folder, tmp_path, text, sentence):
     with pytest.raises(ValueError) as refused:
         one(paths, text, tmp_path)
     assert sentence in str(refused.value) and "\n" not in str(refused.value)
+
+
+def test_the_refusal_of_a_table_contains_a_draft_of_its_map(folder, tmp_path):
+    """The draft takes time, units and quantities from the columns' names, and reads the table when used as a map."""
+    rows = "".join(f"{20 * i},{0.01 * i},{i},0.5,9.8,{-i},a\n" for i in range(50))
+    names = "time_ms,gyro_x,heading_deg,Depth [cm],accel z (m/s2),rate_s,note"
+    paths = folder(log__csv=f"{names}\n{rows}")
+    with pytest.raises(CalibrationError, match="no time; its columns are time_ms, gyro_x") as refused:
+        read_trials(paths)
+    draft = re.search("'(files: .*)', check its units, signs and axes", str(refused.value))
+    trial = one(paths, draft[1], tmp_path)
+    i = np.arange(50.0)
+    np.testing.assert_allclose(trial.t, 0.02 * i, atol=1e-12)
+    assert set(trial.channels) == {"p", "yaw", "depth", "az"}
+    for column, expected in {"p": 0.01 * i, "yaw": np.radians(i), "depth": 0.005, "az": 9.8}.items():
+        np.testing.assert_allclose(trial.channels[column], expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("names", "draft"),
+    [
+        (
+            "when,u,vel",
+            'files: {"log.csv": {time: COLUMN, columns: {u: u}, frame: FLU}}',
+        ),
+        (
+            "Timestamp [us],rollRate,yaw_m,wz_dps,battery_voltage",
+            'files: {"log.csv": {time: {column: "Timestamp [us]", unit: us}, columns: {p: rollRate, '
+            "r: {column: wz_dps, unit: deg/s}, voltage: battery_voltage}, frame: FLU}}",
+        ),
+        ("t,a,b", 'files: {"log.csv": {time: t, columns: {u: COLUMN}, frame: FLU}}'),
+    ],
+)
+def test_a_draft_leaves_open_what_names_do_not_state(folder, names, draft):
+    """Unknown names, and units of another dimension, are left to the user."""
+    count = names.count(",") + 1
+    paths = folder(log__csv=names + "\n" + "".join(",".join([f"{i}"] * count) + "\n" for i in range(9)))
+    with pytest.raises(CalibrationError) as refused:
+        read_trials(paths)
+    assert f"'{draft}', check" in str(refused.value)
 
 
 def test_clocks_that_do_not_meet_are_refused(folder, tmp_path):

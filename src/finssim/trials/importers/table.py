@@ -16,10 +16,11 @@ from finssim.core.budget import CELLS
 from finssim.core.importer import Importer
 from finssim.core.text_table import decoded, text_table
 from finssim.core.yaml_file import read_mapping
-from finssim.trials.conversion import EULER, factor
+from finssim.trials.conversion import EULER, TIME_NAMES, factor
 from finssim.trials.findings import CalibrationError, Finding, finding, listed
 from finssim.trials.importers.assemble import Stream, in_our_axes
 from finssim.trials.importers.column_map import SourceMap, TimeColumn, Validity, present
+from finssim.trials.importers.draft_map import draft_map
 from finssim.trials.importers.log import Request, TrialStreams
 from finssim.trials.trial import Array, column_of
 from finssim.trials.trial_files import ColumnTable, read_table
@@ -27,9 +28,6 @@ from finssim.vehicles.part import did_you_mean
 
 TEXTS = (".csv", ".tsv", ".txt", ".dat")
 SUFFIXES = (*TEXTS, ".parquet", ".pq", ".npz")
-TIME_NAMES = ("t", "time", "time_s", "time_secs", "timestamp", "stamp")
-"""Names of the time column without a map; times are in seconds."""
-
 WORST_FOM = 0.4
 """Figure of merit of a Doppler log from which BlueOS' extension for it ignores a velocity [m/s]."""
 
@@ -251,7 +249,7 @@ def _by_names(table: ColumnTable, label: str) -> SourceMap:
         missing = "time" if time is None else "column with the name of a trial's column"
         raise CalibrationError(
             f"{label}: no {missing}; its columns are {_column_list(table)}: describe them in a map file, such as "
-            f"'files: {{\"{label}\": {{time: COLUMN, columns: {{u: COLUMN}}}}}}', and give it with --map"
+            f"'{draft_map(table, label)}', check its units, signs and axes, and give it with --map"
         )
     phase = "phase" if "phase" in table.words else None
     unit = "s" if time in table.numbers else "date"
