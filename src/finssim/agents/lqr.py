@@ -91,9 +91,10 @@ class Lqr:
         scale = np.repeat([POSITION_SCALE, ANGLE_SCALE], 3)
         gains = np.stack([_gains(body, i, float(scale[i]), lag, delays, period) for i in range(6)])
         model = body.model
-        cruise = CRUISE * model.terminal_speed(body.wrench_limits)
+        driven = gains[:, 0] > 0.0
+        cruise = CRUISE * np.where(driven, model.terminal_speed(body.wrench_limits), 0.0)
         braking = gains[:, 1] + model.damping(cruise)
-        reach = np.divide(braking * cruise, gains[:, 0], out=np.full(6, np.inf), where=gains[:, 0] > 0.0)
+        reach = np.divide(braking * cruise, gains[:, 0], out=np.full(6, np.inf), where=driven)
         return cls(body=body, gains=gains, error_limit=reach, lag=lag, delays=delays, period=period)
 
     @property

@@ -186,7 +186,7 @@ class Pid:
             )
         gains = Gains(*(np.where(able, gain, 0.0) for gain in (placed.kp, placed.kd, placed.rate)))
 
-        cruise = CRUISE * model.terminal_speed(limits)
+        cruise = CRUISE * np.where(able, model.terminal_speed(limits), 0.0)
         braking = gains.kd - model.inertia * gains.rate + model.damping(cruise)
         reach = np.divide(braking * cruise, gains.kp, out=np.full(6, np.inf), where=gains.kp > 0.0)
         return cls(

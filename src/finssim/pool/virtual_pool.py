@@ -163,11 +163,11 @@ def read_truth(path: str | Path) -> Truth:
     layout = np.dtype([("time", "<f8"), *((name, "<f4", (size,)) for name, size in fields.items())])
     body = data[data.index(b"\n") + 1 :]
     table = np.frombuffer(body, dtype=layout, count=len(body) // layout.itemsize)
-    columns = {name: table[name].astype(float) for name in fields}
-    columns["voltage"] = columns["voltage"][:, 0]
     time = table["time"].astype(float)
     if not (np.isfinite(time).all() and (np.diff(time) > 0.0).all()):
         raise TruthError(f"{path}: is damaged: its times do not increase: give the file as the pool wrote it")
+    columns = {name: table[name].astype(float) for name in fields}
+    columns["voltage"] = columns["voltage"][:, 0]
     return Truth(header=header, time=time, **columns)
 
 
