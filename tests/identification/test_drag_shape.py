@@ -29,12 +29,8 @@ def test_the_prior_of_linear_drag_equals_quadratic_drag_at_the_top_speed(size, t
 def test_an_uncertain_thrust_widens_the_intervals_of_both_terms():
     """With thrust of standard deviation s, both terms vary by their sensitivities g on top of their own spread:
     half widths add in squares, and the averages stay."""
-    A, x, s, g = (
-        np.array([[0.04, -0.03], [-0.03, 0.09]]),
-        np.array([4.0, 6.0, 1.0]),
-        0.05,
-        np.array([5.0, 8.0]),
-    )
+    A, x = np.array([[0.04, -0.03], [-0.03, 0.09]]), np.array([4.0, 6.0, 1.0])
+    s, g = 0.05, np.array([5.0, 8.0])
 
     def shape(g):
         C = np.zeros((3, 3))

@@ -200,7 +200,7 @@ class AutopilotFaults:
     no_ground_heartbeat: bool = False
     """True if the HEARTBEAT of the ground station does not reach it."""
     position_lag: float = 0.0
-    """Age of its own position, which it sends as the present one [s]."""
+    """Delay of the position that it reports as its present one [s]."""
     leak: bool = False
     """True if its leak sensor detects water."""
     battery_voltage: float = 0.0

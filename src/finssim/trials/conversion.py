@@ -30,9 +30,6 @@ GRAVITY = 9.80665
 POUND = 0.45359237
 """Mass of a pound, for the unit lbf; an ounce (ozf) is a sixteenth [kg]."""
 
-TIME_NAMES = ("t", "time", "time_s", "time_secs", "timestamp", "stamp")
-"""Names of the time column without a map; times are in seconds."""
-
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
 """Unit of time -> seconds."""
 

@@ -290,14 +290,16 @@ def test_one_sentence_says_what_is_wrong(folder, tmp_path, text, sentence):
 
 
 def test_the_refusal_of_a_table_contains_a_draft_of_its_map(folder, tmp_path):
-    """The draft takes time, units and quantities from the columns' names, and reads the table when used as a map."""
+    """The draft takes time, units and quantities from the columns' names; with axes filled in, it reads the table."""
     rows = "".join(f"{20 * i},{0.01 * i},{i},0.5,9.8,{-i},a\n" for i in range(50))
     names = "time_ms,gyro_x,heading_deg,Depth [cm],accel z (m/s2),rate_s,note"
     paths = folder(log__csv=f"{names}\n{rows}")
     with pytest.raises(CalibrationError, match="no time; its columns are time_ms, gyro_x") as refused:
         read_trials(paths)
-    draft = re.search("'(files: .*)', check its units, signs and axes", str(refused.value))
-    trial = one(paths, draft[1], tmp_path)
+    draft = re.search("'(files: .*)', replace the words in capitals", str(refused.value))[1]
+    with pytest.raises(CalibrationError, match="FLU_OR_FRD', expected FLU, FRD"):
+        one(paths, draft, tmp_path)
+    trial = one(paths, draft.replace("FLU_OR_FRD", "FLU"), tmp_path)
     i = np.arange(50.0)
     np.testing.assert_allclose(trial.t, 0.02 * i, atol=1e-12)
     assert set(trial.channels) == {"p", "yaw", "depth", "az"}
@@ -310,14 +312,18 @@ def test_the_refusal_of_a_table_contains_a_draft_of_its_map(folder, tmp_path):
     [
         (
             "when,u,vel",
-            'files: {"log.csv": {time: COLUMN, columns: {u: u}, frame: FLU}}',
+            'files: {"log.csv": {time: COLUMN, columns: {u: u}, frame: FLU_OR_FRD}}',
         ),
         (
             "Timestamp [us],rollRate,yaw_m,wz_dps,battery_voltage",
             'files: {"log.csv": {time: {column: "Timestamp [us]", unit: us}, columns: {p: rollRate, '
-            "r: {column: wz_dps, unit: deg/s}, voltage: battery_voltage}, frame: FLU}}",
+            "r: {column: wz_dps, unit: deg/s}, voltage: battery_voltage}, frame: FLU_OR_FRD}}",
         ),
-        ("t,a,b", 'files: {"log.csv": {time: t, columns: {u: COLUMN}, frame: FLU}}'),
+        (
+            "t_h,gx,p,heading_m",
+            'files: {"log.csv": {time: {column: t_h, unit: h}, columns: {p: p}, frame: FLU_OR_FRD}}',
+        ),
+        ("t,a,b", 'files: {"log.csv": {time: t, columns: {u: COLUMN}, frame: FLU_OR_FRD}}'),
     ],
 )
 def test_a_draft_leaves_open_what_names_do_not_state(folder, names, draft):
@@ -326,7 +332,7 @@ def test_a_draft_leaves_open_what_names_do_not_state(folder, names, draft):
     paths = folder(log__csv=names + "\n" + "".join(",".join([f"{i}"] * count) + "\n" for i in range(9)))
     with pytest.raises(CalibrationError) as refused:
         read_trials(paths)
-    assert f"'{draft}', check" in str(refused.value)
+    assert f"'{draft}', replace" in str(refused.value)
 
 
 def test_clocks_that_do_not_meet_are_refused(folder, tmp_path):

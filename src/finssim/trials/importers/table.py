@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
 import warnings
@@ -16,18 +17,45 @@ from finssim.core.budget import CELLS
 from finssim.core.importer import Importer
 from finssim.core.text_table import decoded, text_table
 from finssim.core.yaml_file import read_mapping
-from finssim.trials.conversion import EULER, TIME_NAMES, factor
+from finssim.trials.conversion import EULER, TIME_UNITS, UNITS, factor, unit_of
 from finssim.trials.findings import CalibrationError, Finding, finding, listed
 from finssim.trials.importers.assemble import Stream, in_our_axes
 from finssim.trials.importers.column_map import SourceMap, TimeColumn, Validity, present
-from finssim.trials.importers.draft_map import draft_map
 from finssim.trials.importers.log import Request, TrialStreams
-from finssim.trials.trial import Array, column_of
+from finssim.trials.trial import COLUMNS, Array, column_of
 from finssim.trials.trial_files import ColumnTable, read_table
 from finssim.vehicles.part import did_you_mean
 
 TEXTS = (".csv", ".tsv", ".txt", ".dat")
 SUFFIXES = (*TEXTS, ".parquet", ".pq", ".npz")
+TIME_NAMES = ("t", "time", "time_s", "time_secs", "timestamp", "stamp")
+"""Names of the time column without a map; times are in seconds."""
+
+_UNIT_OF_SUFFIX = {
+    **{
+        suffix: unit
+        for units in (*UNITS.values(), TIME_UNITS)
+        for unit in units
+        for suffix in (unit.lower(), unit.lower().replace("/", "_"))
+    },
+    "sec": "s", "secs": "s", "degrees": "deg", "dps": "deg/s", "mps": "m/s", "mps2": "m/s2",
+}  # fmt: skip
+"""Suffix of a column's name, in lower case -> unit."""
+
+_COLUMN_OF_NAME = {
+    **dict(zip(COLUMNS, COLUMNS, strict=True)),
+    **{f"{word}{axis}": f"a{axis}" for word in ("acc", "acc_", "accel", "accel_") for axis in "xyz"},
+    **{
+        f"{word}{axis}": rate
+        for word in ("g", "w", "gyro", "gyro_", "gyr_", "omega_")
+        for axis, rate in zip("xyz", "pqr", strict=True)
+    },
+    **{f"pos_{axis}": axis for axis in "xyz"},
+    "rollrate": "p", "pitchrate": "q", "yawrate": "r", "rollspeed": "p", "pitchspeed": "q", "yawspeed": "r",
+    "heading": "yaw", "pressure": "pressure", "battery_voltage": "voltage",
+}  # fmt: skip
+"""Common name of a quantity, in lower case and without its unit -> canonical column."""
+
 WORST_FOM = 0.4
 """Figure of merit of a Doppler log from which BlueOS' extension for it ignores a velocity [m/s]."""
 
@@ -249,7 +277,8 @@ def _by_names(table: ColumnTable, label: str) -> SourceMap:
         missing = "time" if time is None else "column with the name of a trial's column"
         raise CalibrationError(
             f"{label}: no {missing}; its columns are {_column_list(table)}: describe them in a map file, such as "
-            f"'{draft_map(table, label)}', check its units, signs and axes, and give it with --map"
+            f"'{_draft_map(table, label)}', replace the words in capitals, check units and signs, "
+            "and give it with --map"
         )
     phase = "phase" if "phase" in table.words else None
     unit = "s" if time in table.numbers else "date"
@@ -260,6 +289,45 @@ def _by_names(table: ColumnTable, label: str) -> SourceMap:
             "phase": phase,
         }
     )
+
+
+def _draft_map(table: ColumnTable, label: str) -> str:
+    """Return a map of the columns with common names as one line of YAML; what names do not state is in capitals."""
+    time, columns = "COLUMN", dict[str, str]()
+    for name in sorted(table.columns, key=lambda name: column_of(name) is None):  # canonical names first
+        base, unit = _without_unit(name)
+        column = name if column_of(name) is not None else _COLUMN_OF_NAME.get(base)
+        if base in TIME_NAMES and time == "COLUMN" and (unit is None or unit in TIME_UNITS):
+            time = _source(name, "date" if name in table.words else unit if unit != "s" else None)
+        elif column is not None and column not in columns and name in table.numbers and _fits(unit, column):
+            columns[column] = _source(name, unit if unit != unit_of(column) else None)
+    pairs = ", ".join(f"{column}: {source}" for column, source in columns.items()) or "u: COLUMN"
+    return f"files: {{{json.dumps(label)}: {{time: {time}, columns: {{{pairs}}}, frame: FLU_OR_FRD}}}}"
+
+
+def _without_unit(name: str) -> tuple[str, str | None]:
+    """Return a name in lower case without its unit, and the unit: `yaw` and `deg` of `Yaw [deg]`."""
+    word = name.strip().lower().replace(" ", "_")
+    if column_of(name) is None and word not in TIME_NAMES:
+        for suffix in sorted(_UNIT_OF_SUFFIX, key=len, reverse=True):
+            for end in (f"_{suffix}", f"[{suffix}]", f"({suffix})"):
+                if word.endswith(end) and word != end:
+                    return word.removesuffix(end).rstrip("_"), _UNIT_OF_SUFFIX[suffix]
+    return word, None
+
+
+def _source(name: str, unit: str | None) -> str:
+    """Return the source of a column in YAML, with the name quoted unless it is a word."""
+    name = name if name.isidentifier() and name.isascii() else json.dumps(name)
+    return name if unit is None else f"{{column: {name}, unit: {unit}}}"
+
+
+def _fits(unit: str | None, column: str) -> bool:
+    try:
+        factor(unit, column)
+    except CalibrationError:
+        return False
+    return True
 
 
 def _require_column(table: ColumnTable, name: str, label: str) -> None:
